@@ -145,7 +145,7 @@ _OUTPUTS: Final = {
 
 _FORM: Final = "--unit --clock --shape --byte-order --header --frame-header --variable --simulated"
 _COMMANDS: Final = f"""
-demo demo.demo folder --side-by-side
+demo steps.demo folder --side-by-side
 write files of a simulated rig, to try everything without cameras, and print the next commands
 try-it
 try-it --side-by-side
@@ -259,13 +259,9 @@ def _parser() -> argparse.ArgumentParser:
         head, summary, *lines = block.splitlines()
         name, place, *arguments = head.split()
         examples = [f"  dbthermal {name} {line}".rstrip(" -") for line in lines]
-        command = commands.add_parser(
-            name,
-            help=summary,
-            description=f"{summary[0].upper()}{summary[1:]}.",
-            epilog="\n".join(["examples:", *examples]),
-            **plain,
-        )
+        about: Any = {"help": summary, "description": f"{summary[0].upper()}{summary[1:]}."}
+        about["epilog"] = "\n".join(["examples:", *examples])
+        command = commands.add_parser(name, **about, **plain)
         command.set_defaults(place=place)
         command._negative_number_matcher = re.compile(r"-[\d.]+[CK]?$")  # no option: -5C
         writes = ["--overwrite"] if "--output" in arguments else []

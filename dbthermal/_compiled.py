@@ -11,6 +11,7 @@ import os
 import pickle
 import sys
 import threading
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -59,19 +60,13 @@ Sums may be taken in any order; NaN stays NaN.
 """
 
 
-class _Locks(threading.local):
-    """Locked files, by their numbers, of the thread that compiles."""
-
-    def __init__(self) -> None:
-        self.files: list[int] = []
-
-
 class _Cache(FunctionCache):
     """Files of a compiled function, one for each kind of arguments and processor."""
 
     def __init__(self, function: Any) -> None:
         super().__init__(function.py_func)  # type: ignore[no-untyped-call]
-        self._function, self._locks = function, _Locks()
+        self._function = function
+        self._locks = defaultdict[int, list[int]](list)  # numbers of locked files, by the thread
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Machine code for arguments, None if it is to be compiled, by this process alone."""
@@ -103,7 +98,7 @@ class _Cache(FunctionCache):
         """Compilation that frees the lock of its file at its end, however it ends."""
 
         def compile_in_turn(sig: Any) -> Any:
-            files = self._locks.files
+            files = self._locks[threading.get_ident()]
             held = len(files)
             try:
                 return compile_for(sig)
@@ -120,7 +115,7 @@ class _Cache(FunctionCache):
         with suppress(OSError, AttributeError):
             path.parent.mkdir(parents=True, exist_ok=True)
             lock = os.open(path.with_suffix(".lock"), os.O_RDWR | os.O_CREAT, 0o666)
-            self._locks.files.append(lock)
+            self._locks[threading.get_ident()].append(lock)
             fcntl.flock(lock, fcntl.LOCK_EX)
 
     def _place(self, sig: Any, codegen: Any) -> tuple[Path, bytes]:

@@ -13,14 +13,11 @@ from dbthermal._arrays import Array
 
 Limits = tuple[float, float]
 
+# Limits of what is finite and positive; of counts or kelvin that a detector may have; and of a
+# temperature [K] that is in kelvin, and not in degrees Celsius or counts.
 POSITIVE: Final = (np.nextafter(0.0, 1.0), np.finfo(np.float64).max)
-"""Limits of what is finite and positive."""
-
 FINITE: Final = (-1e9, 1e9)
-"""Limits of what is finite, of counts or kelvin that a detector may have."""
-
 KELVIN: Final = (150.0, 3000.0)
-"""Limits of a temperature [K] that is in kelvin, and not in degrees Celsius or counts."""
 
 
 def real_numbers(

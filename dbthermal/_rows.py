@@ -4,7 +4,7 @@ A long capture fits in memory raw, but not corrected as well. It is read like an
 the memory of the selected rows.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Final
 
 import numpy as np
@@ -77,6 +77,13 @@ def windows(shape: tuple[int, ...], samples: int = 0) -> Iterator[tuple[slice, s
             yield rows, slice(start, min(start + pixels, shape[-1]))
 
 
+def slabs(dataset: xr.Dataset, rows: Iterable[slice]) -> Iterator[xr.Dataset]:
+    """Yield blocks of rows of a dataset; the memory of those before is freed."""
+    for block in rows:
+        release()
+        yield dataset.isel(y=block, missing_dims="ignore")
+
+
 def lazy(compute: Callable[[slice], Values], like: xr.DataArray) -> xr.DataArray:
     """Array with the coordinates and attributes of another, computed by rows, on disk only once."""
     return by_pixels(lambda rows, columns: compute(rows)[..., columns], like)
@@ -93,3 +100,13 @@ def by_pixels(compute: Callable[[slice, slice], Values], like: xr.DataArray) -> 
         array = _Rows(lambda rows, columns: film[..., rows, columns], like.shape)
     variable = xr.Variable(like.dims, indexing.LazilyIndexedArray(array), like.attrs)
     return xr.DataArray(variable, coords=like.coords, name=like.name)
+
+
+def changed(like: xr.DataArray, change: Callable[[Values], Values], *, lazy: bool) -> xr.DataArray:
+    """Array with other values, of the same type, by rows when they are read, or now."""
+
+    def compute(rows: slice, columns: slice = slice(None)) -> Values:
+        values = like.isel(y=rows, x=columns).values
+        return np.asarray(change(values), dtype=values.dtype)
+
+    return by_pixels(compute, like) if lazy else like.copy(data=compute(slice(None)))

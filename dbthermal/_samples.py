@@ -45,8 +45,7 @@ _UNLIKE: Final = 20.0  # largest ratio of a motion between bands
 _MARGIN: Final = 1.25  # on the probability of a value, for noise that differs between pixels
 _COARSE: Final = 0.4  # probability of a value above which counts are too coarse to be judged
 _FALSE_ALARM: Final = 1e-5  # probability that a good pixel or frame is flagged
-FEWEST: Final = 3
-"""Fewest samples on one value, and repeats in a row, that are taken for more than chance."""
+FEWEST: Final = 3  # samples on one value, or repeats in a row, that are more than chance
 
 _OFF_MULTIPLE: Final = 0.01  # distance from a multiple of the step at which a change is none
 _END: Final = 2.0  # width [noise] of the end of a pixel's values
@@ -73,8 +72,7 @@ def noise(signal: npt.NDArray[Any]) -> Array:
 
 
 def larger_noise(signals: npt.NDArray[Any], stated: Array) -> Array:
-    r"""
-    Noise (band) where signals (band, time, pixel) prove more than the stated (band), else NaN [K].
+    r"""Noise (band) where signals (band, time, pixel) prove more than stated (band), else NaN [K].
 
     Second differences of groups of three frames are noise in the stillest tenth of the groups,
     which are selected by the second differences of their neighbours in all bands, and by the third
@@ -96,15 +94,12 @@ def larger_noise(signals: npt.NDArray[Any], stated: Array) -> Array:
     if _STILLEST * (groups - 4) * signals.shape[2] < _FEWEST_STILL:
         return np.full(bands, np.nan)
     three = signals[:, : 3 * groups].reshape(bands, groups, 3, -1)
-    rapid, change, surroundings = np.empty((3, bands, groups - 4, signals.shape[2]))
+    statistics = np.empty((3, bands, groups - 4, signals.shape[2]))
     step = max(16, _AT_ONCE // three[:, 0].size)
     for start in range(0, groups - 4, step):
         stop = min(start + step, groups - 4)
-        differences = _differences(three[:, start : stop + 4])
-        rapid[:, start:stop], change[:, start:stop], surroundings[:, start:stop] = differences
-    rapid, change, surroundings = (
-        statistic.reshape(bands, -1) for statistic in (rapid, change, surroundings)
-    )
+        statistics[:, :, start:stop] = _differences(three[:, start : stop + 4])
+    rapid, change, surroundings = statistics.reshape(3, bands, -1)
     # Select the stillest tenth of the groups.
     valid = np.all(np.isfinite(rapid) & (surroundings > 0), axis=0)  # NaN is not
     number = int(_STILLEST * np.count_nonzero(valid))

@@ -5,8 +5,7 @@ from typing import Final
 
 import xarray as xr
 
-NAME: Final = "warnings"
-"""Attribute, a list of sentences."""
+NAME: Final = "warnings"  # attribute, a list of sentences
 
 
 def warned(dataset: xr.Dataset, *sentences: str) -> xr.Dataset:

@@ -134,7 +134,7 @@ def get(name: str) -> Band:
     Parameters
     ----------
     name : str
-        Name, e.g. "9.5"; KeyError, which lists those known, for another.
+        Name; KeyError, which lists those known, for another.
 
     Examples
     --------

@@ -11,9 +11,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import chdtr, chdtri, ndtri
 
-from dbthermal import _numbers, schema
-from dbthermal import _smooth as smooth
-from dbthermal._arrays import Array
+from dbthermal import _numbers, _smooth, schema
+from dbthermal._arrays import Array, quotient
 
 __all__ = ["MINIMUM_FRAMES", "estimate"]
 __dir__ = __all__.copy
@@ -73,10 +72,8 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
 
     Parameters
     ----------
-    first, second : ndarray, shape (time, pixel)
-        Signals of the two bands, each in a unit of its own.
-    time : array_like, shape (time,)
-        Times [s].
+    first, second, time : ndarray
+        Signals (time, pixel) of the two bands, each in a unit of its own; times (time,) [s].
 
     Examples
     --------
@@ -104,14 +101,12 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
     for signal in (first, second):
         schema.require_measured(signal, "signal")
     # Remove the object: smooth functions, then second differences.
-    functions = smooth.polynomial_basis(time, min(_ORDER, frames // 4))
+    functions = _smooth.polynomial_basis(time, min(_ORDER, frames // 4))
     rapid = [signal - functions @ (functions.T @ signal) for signal in (first, second)]
     # The projection on K functions of N frames leaves 1 - K / N of the noise's variance.
     remaining = 1.0 - functions.shape[1] / frames
     differences = [second_difference(residual, time) for residual in rapid]
-    auto_first, cross, auto_second = (
-        moment / remaining for moment in _trimmed_covariance(*differences)
-    )
+    auto_first, cross, auto_second = np.divide(_trimmed_covariance(*differences), remaining)
     # Ratio of the bands' rapid changes one frame apart, where noise does not enter.
     signal, partner = rapid
     lagged = (signal[1:] * partner[:-1] + signal[:-1] * partner[1:]).sum(axis=0)
@@ -147,19 +142,13 @@ def estimate_bands(signals: Sequence[Array], time: npt.ArrayLike) -> Array:
 
 def _trimmed_covariance(first: Array, second: Array) -> tuple[Array, Array, Array]:
     """Variances and covariance (pixel) over the frames without steps, within a common ellipse."""
-    scales = [MAD * np.median(np.abs(difference), axis=0) for difference in (first, second)]
     first_scaled, second_scaled = (
-        np.divide(difference, std, out=np.zeros_like(difference), where=std > 0)
-        for difference, std in zip((first, second), scales, strict=True)
+        quotient(change, MAD * np.median(np.abs(change), axis=0), 0.0) for change in (first, second)
     )
     # Robust correlation (Gnanadesikan, Kettenring 1972, doi:10.2307/2528963).
-    plus, minus = (
-        np.median(np.abs(difference), axis=0) ** 2
-        for difference in (first_scaled + second_scaled, first_scaled - second_scaled)
-    )
-    correlation = np.divide(
-        plus - minus, plus + minus, out=np.zeros_like(plus), where=plus + minus > 0
-    )
+    pair = first_scaled + second_scaled, first_scaled - second_scaled
+    plus, minus = np.median(np.abs(pair), axis=1) ** 2
+    correlation = quotient(plus - minus, plus + minus, 0.0)
     distance = first_scaled**2 - 2.0 * correlation * first_scaled * second_scaled + second_scaled**2
     # Squared Mahalanobis distance: (a^2 - 2 r a b + b^2) / (1 - r^2).
     keep = distance <= _TRIM * (1.0 - correlation**2)

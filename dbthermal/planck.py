@@ -54,11 +54,13 @@ def spectral_radiance(wavelength: npt.ArrayLike, temperature: npt.ArrayLike) -> 
 
     Examples
     --------
+    Temperature of a surface of emissivity 0.9 at 300 K that reflects nothing.
+
     >>> radiance = spectral_radiance(10e-6, 300.0)
     >>> round(float(radiance) * 1e-6, 3)  # [W m^-2 sr^-1 um^-1]
     9.924
-    >>> round(float(brightness_temperature(10e-6, radiance)), 6)
-    300.0
+    >>> round(float(brightness_temperature(10e-6, 0.9 * radiance)), 1)  # [K]
+    293.6
     """
     wavelength = require_positive("wavelength [m]", wavelength)
     temperature = require_positive("temperature [K]", temperature)
@@ -98,14 +100,6 @@ def brightness_temperature(wavelength: npt.ArrayLike, radiance: npt.ArrayLike) -
     ----------
     wavelength, radiance : array_like
         Wavelength [m] and spectral radiance [W m^-2 sr^-1 m^-1].
-
-    Examples
-    --------
-    A surface of emissivity 0.9 at 300 K that reflects nothing.
-
-    >>> radiance = 0.9 * spectral_radiance(10e-6, 300.0)
-    >>> round(float(brightness_temperature(10e-6, radiance)), 1)  # [K]
-    293.6
     """
     wavelength = require_positive("wavelength [m]", wavelength)
     radiance = require_positive("spectral radiance [W m^-2 sr^-1 m^-1]", radiance)

@@ -83,18 +83,10 @@ class Curve:
     ----------
     band : str
         Name of the band.
-    amplitude : float
-        C [count].
-    wavelength : float
-        A, effective wavelength [m].
-    shift : float
-        B [m K].
-    offset : float
-        O [count].
-    reference : float
-        Reference temperature :math:`T_r` [K].
-    lowest, highest : float
-        Calibrated range [K].
+    amplitude, wavelength, shift, offset : float
+        C [count], A (effective wavelength) [m], B [m K] and O [count].
+    reference, lowest, highest : float
+        Reference temperature :math:`T_r`, and calibrated range [K].
 
     References
     ----------
@@ -171,10 +163,8 @@ class LinearCurve(Curve):
 
     Attributes
     ----------
-    amplitude : float
-        Slope [count/K].
-    offset : float
-        Intercept [count]; `wavelength` and `shift` are not used.
+    amplitude, offset : float
+        Slope [count/K] and intercept [count]; `wavelength` and `shift` are not used.
     """
 
     def counts(self, temperature: npt.ArrayLike) -> Array:
@@ -264,10 +254,8 @@ def curve(response: xr.Dataset, band: str, kind: str = "exact") -> Curve:
 
     Parameters
     ----------
-    response : Dataset
-        Stage `response` of `schema`.
-    band : str
-        Name of the band.
+    response, band : Dataset, str
+        Stage `response` of `schema`; name of the band.
     kind : {"exact", "linear"}
         Sakuma-Hattori, or the linear pair.
     """
@@ -363,10 +351,8 @@ def apparent_temperature(response: xr.Dataset, counts: xr.DataArray) -> xr.DataA
 
     Parameters
     ----------
-    response : Dataset
-        Stage `response` of `schema`.
-    counts : DataArray
-        (band, ...) [count].
+    response, counts : Dataset, DataArray
+        Stage `response` of `schema`; counts (band, ...) [count].
 
     Examples
     --------

@@ -14,9 +14,8 @@ import xarray as xr
 
 from dbthermal import _rows, schema, store
 from dbthermal import response as responses
-from dbthermal._arrays import made_on_disk, on_disk, release
-from dbthermal.alignment import _joint as joint
-from dbthermal.alignment import align, register
+from dbthermal._arrays import made_on_disk, on_disk
+from dbthermal.alignment import _joint, align, register
 from dbthermal.alignment._planes import Scale, share_displaced
 from dbthermal.alignment._resampling import on_one_clock
 from dbthermal.alignment._views import registered
@@ -30,10 +29,8 @@ __all__ = ["separate_capture"]
 __dir__ = __all__.copy
 
 _STEPS: Final[tuple[Callable[..., Any], ...]] = (correct_capture, align, separate)
-SAMPLE: Final = 220
-"""Memory that a sample of a pixel takes at most while it is separated in memory [byte]."""
-ROW: Final = 75
-"""The same of a sample of a row, of which two threads have one each, where it is by rows [byte]."""
+SAMPLE: Final = 220  # most memory of a sample of a pixel that is separated in memory [byte]
+ROW: Final = 75  # the same of a sample of a row, where it is by rows, in two threads [byte]
 
 
 def separate_capture(  # noqa: PLR0913 - the options of each step, by name
@@ -56,17 +53,15 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     3. `separation.separate`.
 
     Clocks and shift of a large capture are estimated from means over some pixels and frames.
-    Errors as the steps.
+    Errors and warnings as the steps.
 
     Parameters
     ----------
     capture : Dataset
         Stage `capture` of `schema`, raw. With a `target` it may be lazy, as from
         `store.open_dataset`; it is then read by rows, several times.
-    correction : Dataset
-        From `correction.fit_correction`.
-    response : Dataset
-        From `calibration.fit_response`, with its `noise`.
+    correction, response : Dataset
+        From `correction.fit_correction`, and `calibration.fit_response` with its `noise`.
     registration : {"translation", "affine", "homography"}, optional
         Kind of transform between the views, see `alignment.register`; None if they share a grid. A
         `transform` in `aligning` takes its place.
@@ -88,10 +83,6 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
         `clock`, `time_offset` and `time_offset_std` [s], `frames_lost`, `transform`. From a
         `target` it is lazy.
 
-    Warns
-    -----
-    UserWarning
-        As the steps.
 
     Examples
     --------
@@ -126,9 +117,8 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
             result = separate_capture(
                 capture, correction, response, registration=registration, **options
             )
-            blocks = _rows.blocks(result["object_temperature"].shape)
-            results = (_let_go(result.isel(y=rows)) for rows in blocks)
-            store.save_rows(results, target, provenance or store.provenance({}))
+            slabs = _rows.slabs(result, _rows.blocks(result["object_temperature"].shape))
+            store.save_rows(slabs, target, provenance or store.provenance({}))
         return store.open_dataset(target)
     # Correct each camera, register the views, and synchronise the bands.
     lazy = made_on_disk()
@@ -162,12 +152,6 @@ def _check_options(step: Callable[..., Any], options: Any) -> None:
             raise TypeError(f"Unknown option {option!r} of '{name}'. Must be one of {names}.")
 
 
-def _let_go(rows: xr.Dataset) -> xr.Dataset:
-    """Free the memory of earlier rows; return these."""
-    release()
-    return rows
-
-
 def _aligned(
     corrected: xr.Dataset, response: xr.Dataset, options: Mapping[str, Any]
 ) -> tuple[xr.Dataset, xr.Dataset | None]:
@@ -179,15 +163,15 @@ def _aligned(
     # Stated clocks: the shift alone is estimated.
     if "offset" in options:
         aligned = on_one_clock(corrected, **options)
-        field = joint.apart(corrected, scale, **options)
+        field = _joint.apart(corrected, scale, **options)
         if field is not None and share_displaced(aligned, scale) > 0.0:
             return aligned, field
         return aligned, None
     # Clocks and shift from the images.
-    comparison = joint.compare(corrected, scale, **options)
+    comparison = _joint.compare(corrected, scale, **options)
     aligned = on_one_clock(corrected, **{**options, "offset": comparison.offset})
     if comparison.field is not None and not share_displaced(aligned, scale) > 0.0:
         # Displaced cameras without a shift: their clocks at one place.
-        comparison = joint.compare(corrected, scale, **options, side_by_side=False)
+        comparison = _joint.compare(corrected, scale, **options, side_by_side=False)
         aligned = on_one_clock(corrected, **{**options, "offset": comparison.offset})
     return comparison.noted(aligned), comparison.field

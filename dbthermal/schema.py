@@ -45,14 +45,10 @@ class Variable:
 
     Attributes
     ----------
-    dims : tuple of str
-        Dimensions, in order.
-    dtype : str
-        Type as written; read, any real type of the same kind passes.
-    units, long_name : str
-        Unit and meaning.
-    more : mapping
-        Further attributes.
+    dims, dtype : tuple of str, str
+        Dimensions, in order; type as written: read, any real type of the same kind passes.
+    units, long_name, more : str, str, mapping
+        Unit, meaning, and further attributes.
     """
 
     dims: tuple[str, ...]
@@ -111,20 +107,15 @@ CAUSES: Final[Mapping[str, str]] = MappingProxyType(
         "ratio": "all frames of a pixel, or of a material",
         "drift": "all pixels before the same surroundings",
         "pattern": "all frames of a pixel",
-        "offset": "the image",
-        "gain": "the image",
-        "blackbody": "the image",
-        "room": "the image",
-        "colour": "the image",
+        **dict.fromkeys(("offset", "gain", "blackbody", "room", "colour"), "the image"),
     }
 )
 """Causes of a deviation, and what shares an error by each; all but three are the calibration's."""
 
+# Causes that two bands cannot show (a calibration states them, see `response.accuracy`), and those
+# that a mean over pixels does not lessen.
 CALIBRATION: Final = tuple(CAUSES)[3:]
-"""Causes that two bands cannot show: a calibration states them, see `response.accuracy`."""
-
 SHARED: Final = tuple(cause for cause, of in CAUSES.items() if of == "the image")
-"""Causes that a mean over pixels does not lessen."""
 
 BUDGETS: Final[Mapping[str, str]] = MappingProxyType(
     {
@@ -398,14 +389,11 @@ def check(
 
     Parameters
     ----------
-    dataset : Dataset
-        Data of a stage.
-    stage : str
-        Its name.
-    names : sequence of str
-        Variables of the stage that are checked, where not all are needed.
-    label : str
-        What the error calls it, "the" and the stage by default.
+    dataset, stage : Dataset, str
+        Data of a stage, and its name.
+    names, label : sequence of str, str
+        Variables of the stage that are checked, where not all are needed; what the error calls it,
+        "the" and the stage by default.
 
     Examples
     --------

@@ -10,23 +10,23 @@ HOUSE = Path(dbthermal.__file__).parent
 
 # Lines and modules that a room may have. A room that grows takes from another; these only fall.
 BUDGET = {
-    "": (3519, 18),
-    "_cli": (1263, 7),
+    "": (3455, 18),
+    "_cli": (1226, 5),
     "alignment": (2932, 13),
-    "calibration": (827, 3),
-    "correction": (1850, 7),
-    "emissivity": (452, 3),
-    "explorer": (1345, 7),
-    "figures": (655, 5),
-    "instruments": (5696, 20),
-    "limits": (750, 4),
-    "readers": (2745, 12),
-    "reporting": (439, 3),
+    "calibration": (793, 3),
+    "correction": (1762, 7),
+    "emissivity": (443, 3),
+    "explorer": (1277, 6),
+    "figures": (608, 4),
+    "instruments": (5536, 20),
+    "limits": (723, 4),
+    "readers": (2659, 12),
+    "reporting": (404, 2),
     "separation": (12755, 53),
-    "simulation": (630, 3),
-    "store": (1484, 6),
+    "simulation": (565, 3),
+    "store": (1404, 6),
 }
-INSTALLED = 37_342  # lines of all rooms
+INSTALLED = 36_542  # lines of all rooms
 
 PRONOUNS = {
     *("one", "other", "others", "own", "part", "parts", "some", "here", "there", "told", "known"),

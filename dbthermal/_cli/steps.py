@@ -1,4 +1,4 @@
-"""Steps from a capture to a result; the plan of a capture; the data of the package."""
+"""Demonstration; steps from a capture to a result; plan of a capture; data of the package."""
 
 import argparse
 import math
@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 import xarray as xr
+from scipy.constants import zero_Celsius
 
 from dbthermal import (
     alignment,
@@ -21,22 +22,95 @@ from dbthermal import (
     scene,
     schema,
     separation,
+    simulation,
+    store,
 )
 from dbthermal._cli import PLUS, accepted, files, leaves
-from dbthermal._cli.summary import outline
 from dbthermal._warnings import warned
 from dbthermal.limits._planner import SKY_LEVEL
+from dbthermal.readers._recording import optional
 from dbthermal.response import ACCURACY
 from dbthermal.separation._doubts import hardly_measured
 from dbthermal.separation._run import BASE
 
 _SWEEP = 64  # frames of each temperature of a blackbody that are taken
+# Of the demonstration.
+_SHAPE: Final = (48, 64)  # rows and columns [pixel]
+_FRAMES, _RATE, _STILL = 200, 10.0, 16  # of the scene, its rate [Hz], and of each temperature
+_CELSIUS: Final = (5, 25, 45, 70)  # of the blackbody
+_PLATE: Final = ["plate window glass", "construction concrete", "ultra flat black paint"]
+_VIEW: Final = (2, 4)  # rows and columns by which cameras side by side see the plate apart
+_PARALLAX: Final = 3  # further columns by which they see its reflections apart
+
+_NEXT: Final = """\
+dbthermal import a.tif b.tif --simulated --bands 8-14 9.5 --clock 10 --offset 0 -o scene.zarr
+dbthermal calibrate {sweep} --simulated --bands 8-14 9.5 --clock 10 -o response.zarr \
+--correction-output nuc.zarr
+dbthermal separate scene.zarr response.zarr --correction nuc.zarr{views} -o result.zarr
+dbthermal report result.zarr -o report.html
+dbthermal explore result.zarr -o look.ipynb"""
+"""At most five, that take the files to a report and to the explorer."""
+_SCENE: Final = (
+    "simulated, by no camera: a plate of glass (left) and concrete (right) with a cross of black "
+    "tape, heated from 22 to 60 degC while people walk by"
+)
+
 _OUTPUTS: Final = {
     "import": "capture",
     **dict.fromkeys(("correct", "align"), "corrected"),
     **dict.fromkeys(("separate", "complete"), "separated"),
 }
 """Command -> stage of what it writes, whose size follows from that of a capture."""
+
+
+def demo(options: argparse.Namespace) -> dict[str, Any]:
+    """Command `demo`."""
+    tifffile = optional("tifffile", "recordings")
+    folder: Path = options.folder
+    rig, rng = simulation.Rig(), np.random.default_rng(1)
+    stacks = _demo_stacks(rig, rng, apart=options.side_by_side)
+    # All or nothing: a folder that has one of the files is left as it is.
+    paths = {folder / f"{name}.tif": stack for name, stack in stacks.items()}
+    for path in (path for path in paths if path.exists()):
+        raise FileExistsError(f"There is something at '{path}'. Must be a new folder.")
+    folder.mkdir(parents=True, exist_ok=True)
+    for path, stack in paths.items():
+        with store.whole(path, ".tif") as draft:
+            tifffile.imwrite(draft, stack, photometric="minisblack", description=_SCENE)
+    sweep = " ".join(f"--at {step}C a{step}.tif b{step}.tif" for step in _CELSIUS)
+    views = " --register translation" if options.side_by_side else " --register none --offset 0"
+    commands = _NEXT.format(sweep=sweep, views=views).splitlines()
+    return {str(folder): f"{len(paths)} TIFF stacks, {_SCENE}", "next": [f"cd {folder}", *commands]}
+
+
+def _demo_stacks(rig: simulation.Rig, rng: np.random.Generator, *, apart: bool) -> dict[str, Any]:
+    """Counts (time, y, x) of both cameras, a and b: of the scene, and of each blackbody."""
+    # A plate larger than the view; by its cross of tape displaced views are registered.
+    view, parallax = (_VIEW, _PARALLAX) if apart else ((0, 0), 0)
+    size = (_SHAPE[0] + view[0], _SHAPE[1] + view[1])
+    table = emissivity.embedded_table()["emissivity"].sel(band=list(rig.bands), material=_PLATE)
+    rows, columns = np.ogrid[: size[0], : size[1]]
+    tape = xr.DataArray((abs(rows - 23) < 4) | (abs(columns - 32) < 5), dims=("y", "x"))
+    plate = simulation.side_by_side(table[:2], size).where(~tape, table[2].drop_vars("material"))
+    # Each camera sees its part of it, and the reflections displaced.
+    truth = simulation.walkers(np.arange(_FRAMES) / _RATE, size, plate, rng)
+    films = []
+    for camera, band in enumerate(rig.bands):
+        mirrored = truth["background_temperature"].roll(x=-camera * parallax)
+        top, left = (camera * shift for shift in view)
+        seen = truth.assign(background_temperature=mirrored)
+        seen = seen.isel(y=slice(top, top + _SHAPE[0]), x=slice(left, left + _SHAPE[1]))
+        seen = seen.assign_coords(y=np.arange(_SHAPE[0]), x=np.arange(_SHAPE[1]))
+        films.append(simulation.observe(seen, rig.response(), rng).sel(band=[band]))
+    # Raw counts of two detectors, as they show the scene and the blackbody.
+    detector = simulation.pattern(rig, _SHAPE, rng)
+    shown = simulation.capture(xr.concat(films, dim="band"), detector)
+    kelvin = np.array(_CELSIUS) + zero_Celsius
+    movies = simulation.blackbody_movies(rig, kelvin, _STILL, detector, rng)
+    stacks = dict(zip("ab", shown["counts"].values, strict=True))
+    for name, sweep in zip("ab", movies["counts"].values, strict=True):
+        stacks |= {f"{name}{step}": film for step, film in zip(_CELSIUS, sweep, strict=True)}
+    return stacks
 
 
 def calibrate(options: argparse.Namespace) -> dict[str, Any]:
@@ -150,16 +224,11 @@ def separate(options: argparse.Namespace) -> dict[str, Any]:
     response.load()
     progress = {"progress": sys.stderr.isatty()}
     if options.correction:  # all steps of a raw capture, by rows
-        scene.separate_capture(
-            source,
-            fitted[0].load(),
-            response,
-            registration=None if options.register == "none" else options.register,
-            aligning=_aligning(options, source),
-            separating=accepted(separation.separate, options) | progress,
-            target=options.output,
-            provenance=files.provenance(options),
-        )
+        named = {"target": options.output, "provenance": files.provenance(options)}
+        named["registration"] = None if options.register == "none" else options.register
+        named["aligning"] = _aligning(options, source)
+        named["separating"] = accepted(separation.separate, options) | progress
+        scene.separate_capture(source, fitted[0].load(), response, **named)
     elif options.method is None:  # the default call, in memory
         notes = [note for data in (source, response) for note in data.attrs.get("warnings", [])]
         named = accepted(separation.separate, options) | progress
@@ -175,7 +244,7 @@ def separate(options: argparse.Namespace) -> dict[str, Any]:
             named["emissivity"] = xr.DataArray(options.emissivity, dims="band", coords=axis)
         made_by = files.provenance(options)
         separation.run(options.capture, options.output, response, provenance=made_by, **named)
-    return files.described(options.output)
+    return {str(options.output): files.summary(store.open_dataset(options.output))}
 
 
 def complete(options: argparse.Namespace) -> dict[str, Any]:
@@ -195,10 +264,10 @@ def foreseen(
         contents = [file for file in (path, *path.rglob("*")) if file.is_file()]
         inputs[str(path)] = {"bytes": sum(file.stat().st_size for file in contents)}
         if (path / "zarr.json").is_file():
-            inputs[str(path)] |= outline(files.opened(path))
+            inputs[str(path)] |= files.outline(files.opened(path))
     summary: dict[str, Any] = {"would_read": inputs, "would_write": [*map(str, targets)]}
     if options.command == "import":
-        summary["would_be"] = outline(files.capture(options.files, options, options.offset))
+        summary["would_be"] = files.outline(files.capture(options.files, options, options.offset))
     # Bytes of an output before its compression, and those that the disk has for it.
     outlines = [summary.get("would_be", {}), *inputs.values()]
     sized = [it["sizes"] for it in outlines if "time" in it.get("sizes", {})]
@@ -237,13 +306,10 @@ def plan(options: argparse.Namespace) -> dict[str, Any]:
     noise = emissivity.filter_noise(options.noise, table["band"].values.tolist())
     plans = limits.plan(table, noise, design, outdoors=options.outdoors)
     deviations = plans["object_temperature_std"].transpose("filter", "material").to_pandas()
-    numbers = {
-        str(name): {
-            "best_filter": str(best),
-            "object_temperature_std_K": deviations[name].round(4).to_dict(),
-        }
-        for name, best in plans["best"].to_series().items()
-    }
+    numbers = dict[str, dict[str, Any]]()
+    for name, best in plans["best"].to_series().items():
+        stds = deviations[name].round(4).to_dict()
+        numbers[str(name)] = {"best_filter": str(best), "object_temperature_std_K": stds}
     if options.outdoors:
         for name, costs in plans["sky_error"].transpose("filter", "material").to_pandas().items():
             numbers[str(name)]["sky_error_K"] = costs.round(4).to_dict()

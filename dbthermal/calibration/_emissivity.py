@@ -16,6 +16,8 @@ from dbthermal import response as responses
 from dbthermal._arrays import Array
 from dbthermal.response import Curve, require_range
 
+Pair = tuple[float, float]
+
 _ITERATIONS: Final = 50
 _CONVERGED: Final = 1e-12
 _BEYOND: Final = 3.0  # standard deviations by which an emissivity may lie outside its limits
@@ -53,10 +55,10 @@ class Bias:
     """
 
     object_tolerance: float = 0.0
-    contact: tuple[float, float] = (0.0, 0.0)
+    contact: Pair = (0.0, 0.0)
     air_temperature: float = 295.15
     background_tolerance: float = 0.0
-    stray: tuple[float, float] = (0.0, 0.0)
+    stray: Pair = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         for name in ("object_tolerance", "background_tolerance"):
@@ -68,40 +70,33 @@ class Bias:
                 raise ValueError(f"Invalid {name} ({least}, {largest}). {rule}.")
         _numbers.real_number("air_temperature [K]", self.air_temperature, _numbers.KELVIN)
 
-    @property
-    def _felt(self) -> float:
-        """Mean fraction of the object's excess over the air that the thermocouple reads [1]."""
-        return 1.0 - 0.5 * (self.contact[0] + self.contact[1])
-
-    @property
-    def _mirrored(self) -> float:
-        """Mean fraction of the reflection that comes from the blackbody [1]."""
-        return 1.0 - 0.5 * (self.stray[0] + self.stray[1])
-
     def corrected(self, reading: Array) -> Array:
         """Object temperature [K], T = T_a + (R - T_a) / (1 - m), m the mean contact error."""
-        return self.air_temperature + (reading - self.air_temperature) / self._felt
+        excess = reading - self.air_temperature
+        return self.air_temperature + excess / (1.0 - np.mean(self.contact))
 
     def emitted(self, curve: Curve, temperature: Array, std: float) -> tuple[Array, Array]:
         """Errors of the object's signal [count]: independent (n), and common ones (2, n)."""
-        # dT = dR / (1 - m) + (T - T_a) dm / (1 - m), and dW = U'(T) dT.
-        scale = curve.count_slope(temperature) / self._felt
-        contact = _uniform_std(self.contact) * (temperature - self.air_temperature)
+        # dT = dR / (1 - m) + (T - T_a) dm / (1 - m), and dW = U'(T) dT; m is uniform in its range.
+        scale = curve.count_slope(temperature) / (1.0 - np.mean(self.contact))
+        contact = np.ptp(self.contact) / np.sqrt(12.0) * (temperature - self.air_temperature)
         offset = np.full_like(temperature, self.object_tolerance / 3.0**0.5)
         return np.asarray(scale * std), np.asarray(scale * np.stack([offset, contact]))
 
     def reflection(self, curve: Curve, temperature: Array) -> Array:
         """Reflected signal [count], (1 - s) U(T_b) + s U(T_a), s the mean stray fraction."""
         room = curve.counts(self.air_temperature)
-        return np.asarray(room + self._mirrored * (curve.counts(temperature) - room))
+        excess = curve.counts(temperature) - room
+        return np.asarray(room + (1.0 - np.mean(self.stray)) * excess)
 
     def reflected(self, curve: Curve, temperature: Array, std: float) -> tuple[Array, Array]:
         """Errors of the reflected signal [count] as `emitted`; common: offset, stray fraction."""
         # dW = (1 - s) U'(T_b) dT_b - (U(T_b) - U(T_a)) ds.
-        scale = self._mirrored * curve.count_slope(temperature)
+        scale = (1.0 - np.mean(self.stray)) * curve.count_slope(temperature)
         offset = scale * self.background_tolerance / 3.0**0.5
         excess = curve.counts(temperature) - curve.counts(self.air_temperature)
-        return np.asarray(scale * std), np.stack([offset, _uniform_std(self.stray) * excess])
+        stray = np.ptp(self.stray) / np.sqrt(12.0) * excess
+        return np.asarray(scale * std), np.stack([offset, stray])
 
 
 NO_BIAS: Final = Bias()
@@ -138,10 +133,7 @@ class _Signals(NamedTuple):
 
 
 def fit_emissivity(
-    measured: xr.Dataset,
-    response: xr.Dataset,
-    reading_std: tuple[float, float],
-    bias: Bias = NO_BIAS,
+    measured: xr.Dataset, response: xr.Dataset, reading_std: Pair, bias: Bias = NO_BIAS
 ) -> xr.Dataset:
     r"""Emissivity of a material per band, by contact thermometry and a reflected blackbody.
 
@@ -160,12 +152,10 @@ def fit_emissivity(
     measured : Dataset
         Stage `contact`: `counts` of the material (band, measurement) [count]; `object_temperature`
         by the thermocouple and `background_temperature` of the blackbody (measurement) [K].
-    response : Dataset
-        From `fit_response`, with its noise.
+    response, bias : Dataset, Bias
+        From `fit_response`, with its noise; errors that all readings have in common, by default 0.
     reading_std : tuple of float
         Standard deviation of one reading of the thermocouple and of the blackbody [K], independent.
-    bias : Bias
-        Errors that all readings have in common; by default none.
 
     Returns
     -------
@@ -175,12 +165,11 @@ def fit_emissivity(
 
     Raises
     ------
-    TypeError, ValueError
+    TypeError, ValueError, ArithmeticError
         If an input is not as described or not finite, there are fewer than two measurements, a
         temperature lies outside the response, object and background differ by less than three
-        standard deviations, or a result lies outside `schema.EMISSIVITY_LIMITS` by more than three.
-    ArithmeticError
-        If the fit does not converge.
+        standard deviations, or a result lies outside `schema.EMISSIVITY_LIMITS` by more than three;
+        if the fit does not converge.
 
     References
     ----------
@@ -199,9 +188,8 @@ def fit_emissivity(
     >>> warm = xr.DataArray([303.15, 318.15, 333.15], dims="measurement")  # [K]
     >>> cold = xr.DataArray([323.15, 308.15, 293.15], dims="measurement")
     >>> counts = 0.85 * response.counts(camera, warm) + 0.15 * response.counts(camera, cold)
-    >>> measured = xr.Dataset(
-    ...     {"counts": counts, "object_temperature": warm, "background_temperature": cold}
-    ... )
+    >>> measured = xr.Dataset({"counts": counts, "object_temperature": warm})
+    >>> measured["background_temperature"] = cold
     >>> fit_emissivity(measured, camera, reading_std=(0.1, 0.05)).emissivity.values.round(3)
     array([0.85, 0.85])
     """
@@ -221,10 +209,7 @@ def fit_emissivity(
 
 
 def reflector_emissivity(
-    measured: xr.Dataset,
-    response: xr.Dataset,
-    reading_std: tuple[float, float],
-    bias: Bias = NO_BIAS,
+    measured: xr.Dataset, response: xr.Dataset, reading_std: Pair, bias: Bias = NO_BIAS
 ) -> xr.Dataset:
     r"""Emissivity of a material per band by the reflector method of the standards.
 
@@ -269,9 +254,8 @@ def reflector_emissivity(
     >>> warm, room = (xr.DataArray([kelvin], dims="measurement") for kelvin in (323.15, 295.15))
     >>> foil = response.counts(camera, room)
     >>> counts = 0.3 * response.counts(camera, warm) + 0.7 * foil
-    >>> measured = xr.Dataset(
-    ...     {"counts": counts, "reflected_counts": foil, "object_temperature": warm}
-    ... )
+    >>> measured = xr.Dataset({"counts": counts, "reflected_counts": foil})
+    >>> measured["object_temperature"] = warm
     >>> reflector_emissivity(measured, camera, reading_std=(0.2, 0.3)).emissivity.values.round(3)
     array([0.3, 0.3])
     """
@@ -289,7 +273,7 @@ def reflector_emissivity(
 
 
 def _readings(
-    measured: xr.Dataset, stage: str, reading_std: tuple[float, float], bias: Bias
+    measured: xr.Dataset, stage: str, reading_std: Pair, bias: Bias
 ) -> tuple[Array, Array]:
     """Check the readings; corrected object temperature [K], and deviations of a reading [K]."""
     schema.check(measured, stage)
@@ -364,7 +348,3 @@ def _fit_band(signals: _Signals, name: str) -> tuple[float, float, float, Array]
             "exchanged, or temperatures not in kelvin?"
         )
     return emissivity, std, chi2, residual
-
-
-def _uniform_std(span: tuple[float, float]) -> float:
-    return float((span[1] - span[0]) / np.sqrt(12.0))

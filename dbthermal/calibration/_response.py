@@ -22,8 +22,7 @@ AMBIENT: Final = 298.15
 MINIMUM_TEMPERATURES: Final = 4
 """Fewest blackbody temperatures: the Sakuma-Hattori curve has four parameters."""
 
-TEMPERATURE_STD: Final = 0.1
-"""Standard deviation of the temperature of an area blackbody about its reading [K]."""
+TEMPERATURE_STD: Final = 0.1  # of an area blackbody about its reading [K]
 
 NO_BARS: Final = "maker's constants, without error bars"
 """Attribute ``calibration`` of a response, and of what is made with it."""
@@ -72,7 +71,9 @@ def fit_response(  # noqa: PLR0913 - what is known of blackbody and cameras, by 
 
     TypeError or ValueError if an input is not as described, a value is NaN, or the counts follow no
     Planck curve, as of a camera that saturates, changes its range, or gives counts linear in
-    temperature. The error names the temperature
+    temperature; the error names the temperature. UserWarning if the NETD of a band of
+    `bands.FILTERS` is less than half that of one that contains it: then their names or files may be
+    exchanged.
 
     Parameters
     ----------
@@ -107,11 +108,6 @@ def fit_response(  # noqa: PLR0913 - what is known of blackbody and cameras, by 
         `blackbody_emissivity`, `room_temperature` and `background_ratio_std` as stated. Attribute
         ``blackbody``, the temperatures and their deviations in words, which results repeat.
 
-    Warns
-    -----
-    UserWarning
-        If the NETD of a band of `bands.FILTERS` is less than half that of one that contains it:
-        then their names or files may be exchanged.
 
     References
     ----------
@@ -125,14 +121,10 @@ def fit_response(  # noqa: PLR0913 - what is known of blackbody and cameras, by 
 
     >>> import numpy as np, xarray as xr
     >>> from dbthermal import bands
-    >>> temperature = np.linspace(283.15, 343.15, 7)
-    >>> counts = xr.DataArray(
-    ...     [15000 + 100 * bands.get("8-14").radiance(temperature)],
-    ...     dims=("band", "temperature"),
-    ...     coords={"band": ["8-14"], "temperature": temperature},
-    ... )
-    >>> noise = xr.DataArray([3.0], dims="band", coords={"band": ["8-14"]})
-    >>> fitted = fit_response(counts, noise)
+    >>> axes = {"band": ["8-14"], "temperature": np.linspace(283.15, 343.15, 7)}
+    >>> values = [15000 + 100 * bands.get("8-14").radiance(axes["temperature"])]
+    >>> noise = xr.DataArray([3.0], {"band": ["8-14"]}, "band")
+    >>> fitted = fit_response(xr.DataArray(values, axes, ("band", "temperature")), noise)
     >>> bool(np.abs(fitted.residual).max() < 0.5), round(float(fitted.netd[0]), 3)  # [count], [K]
     (True, 0.038)
     """
@@ -199,18 +191,14 @@ def fit_response(  # noqa: PLR0913 - what is known of blackbody and cameras, by 
 def _exchanged(netd: Mapping[str, float]) -> list[str]:
     """Sentences on bands that are much quieter than one that contains them."""
     filters = [name for name in netd if name in bands.FILTERS]
-    pairs = [
-        (inner, outer)
-        for inner, outer in permutations(filters, 2)
-        if bands.get(outer).lower <= bands.get(inner).lower
-        and bands.get(inner).upper <= bands.get(outer).upper
-        and netd[inner] < _QUIETER * netd[outer]
-    ]
     return [
         f"Noise of {netd[inner]:.3g} K in band '{inner}', of {netd[outer]:.3g} K in '{outer}', "
         "which contains it. A filter must raise the noise: are the names of the bands, or the "
         "files of the blackbody, exchanged?"
-        for inner, outer in pairs
+        for inner, outer in permutations(filters, 2)
+        if bands.get(outer).lower <= bands.get(inner).lower
+        and bands.get(inner).upper <= bands.get(outer).upper
+        and netd[inner] < _QUIETER * netd[outer]
     ]
 
 
@@ -242,11 +230,9 @@ def maker_response(files: Mapping[str, Mapping[str, Any]]) -> xr.Dataset:
 
     Raises
     ------
-    TypeError
-        If the files, or those of a band, are no mapping.
-    ValueError
-        If a constant is missing or not positive, the ranges do not overlap, or the form does not
-        fit.
+    TypeError, ValueError
+        If the files, or those of a band, are no mapping; a constant is missing or not positive, the
+        ranges do not overlap, or the form does not fit.
 
     References
     ----------

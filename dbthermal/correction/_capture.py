@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from dbthermal import _rows, schema
-from dbthermal import _text as texts
+from dbthermal import _rows, _text, schema
 from dbthermal._arrays import Mask
 from dbthermal._warnings import warned
 from dbthermal.correction._frames import sampling, unreported
@@ -32,14 +31,6 @@ def corrected_by_camera(capture: xr.Dataset) -> xr.Dataset:
     Dataset
         Stage `correction` for `correct_capture`: gain 1, offset 0 and no bad pixel (band, y, x);
         attribute ``by_camera`` = 1. TypeError or ValueError if there is no capture.
-
-    Examples
-    --------
-    >>> import numpy as np, xarray as xr
-    >>> counts = (("band", "time", "y", "x"), np.full((1, 2, 2, 2), 18000, np.uint16))
-    >>> capture = xr.Dataset({"counts": counts}, {"band": ["8-14"], "time": [0.0, 0.1]})
-    >>> correct(capture, corrected_by_camera(capture)).gain_offset_corrected
-    0
     """
     ones = xr.ones_like(schema.check(capture, "capture")["counts"][:, 0], dtype=np.float64)
     ones = ones.drop_vars("time", errors="ignore")
@@ -68,14 +59,15 @@ def correct_capture(  # noqa: PLR0913 - the options of each step, by name
     3. `mark_shutter`: repeated, closed and damaged frames (without an exposure time) become NaN,
        and so do frames that neither those before nor those after predict: a shutter that is seen,
        black, torn or random frames, the rarer of two gains. A segment begins, too, where the fixed
-       pattern of one band changes.
-       Pixels whose raw counts heap on one level are saturated, those that repeat their counts for
-       longer than noise does are frozen.
+       pattern of one band changes. Pixels whose raw counts heap on one level are saturated, those
+       that repeat their counts for longer than noise does are frozen.
     4. `undo_lag`, after 3, because a repeated frame says nothing of the pixel's past.
     5. `mark_bad`: pixels that are noisy, stuck or jump, in units of this capture's noise.
     6. `undo_drift` last, so that no bad pixel is part of the reference patch.
 
-    TypeError or ValueError if capture or correction is not of its stage, and as the steps.
+    TypeError or ValueError if capture or correction is not of its stage, and as the steps;
+    UserWarning of bad frames, which it names, of frames that a stream repeats, and of a pattern
+    that changes or is not corrected.
 
     Parameters
     ----------
@@ -113,30 +105,17 @@ def correct_capture(  # noqa: PLR0913 - the options of each step, by name
         show no scene), and ``shutter_closed_frames`` (by band, recorded as closed; -1 without
         `frame_flags`).
 
-    Warns
-    -----
-    UserWarning
-        Of bad frames, which it names, of frames that a stream repeats, and of a pattern that
-        changes or is not corrected.
 
     Examples
     --------
     Two bands of 40 frames, of which the camera repeats one five times while its shutter is closed.
 
     >>> import numpy as np, xarray as xr
-    >>> maps, rng = ("band", "y", "x"), np.random.default_rng(1)
-    >>> gain = 1 + 0.02 * rng.standard_normal((2, 8, 8))
-    >>> correction = xr.Dataset(
-    ...     {"gain": (maps, gain), "offset": (maps, 0 * gain), "bad": (maps, gain < 0)},
-    ...     {"band": ["8-14", "9.5"]},
-    ... )
-    >>> counts = rng.normal(20000, 4, (2, 40, 8, 8)) / gain[:, np.newaxis]
+    >>> counts = np.random.default_rng(1).normal(20000, 4, (2, 40, 8, 8)).astype(np.uint16)
     >>> counts[1, 21:26] = counts[1, 20]
-    >>> capture = xr.Dataset(
-    ...     {"counts": (("band", "time", "y", "x"), counts.round().astype(np.uint16))},
-    ...     {"band": ["8-14", "9.5"], "time": np.arange(40) / 10.0},
-    ... )
-    >>> corrected = correct_capture(capture, correction)
+    >>> axes = {"band": ["8-14", "9.5"], "time": np.arange(40) / 10.0}
+    >>> capture = xr.DataArray(counts, axes, ("band", "time", "y", "x")).to_dataset(name="counts")
+    >>> corrected = correct_capture(capture, corrected_by_camera(capture))
     >>> corrected.shutter_events, corrected.frames_taken_out, int(corrected.segment[-1])
     (1, [0, 5], 1)
     >>> float(corrected.counts.std()) < 5
@@ -145,7 +124,7 @@ def correct_capture(  # noqa: PLR0913 - the options of each step, by name
     schema.check(capture, "capture")
     schema.check(correction, "correction")
     if not isinstance(shutter, bool | np.bool_):
-        raise TypeError(f"Invalid shutter {texts.shown(shutter)}. Must be True or False.")
+        raise TypeError(f"Invalid shutter {_text.shown(shutter)}. Must be True or False.")
     # Steps 1 and 2: distinct frames, shutter events, new offsets.
     before = correction if flat is None else renew_offset(correction, flat)
     maximum = int(correction.attrs.get("detector_maximum", DETECTOR_MAXIMUM))
@@ -230,9 +209,6 @@ def _events(
 
 def _closed(capture: xr.Dataset) -> xr.DataArray | None:
     """Frames (band, time) recorded as taken with the shutter closed; None if not recorded."""
-    if "frame_flags" not in capture:
-        return None
-    flags = capture["frame_flags"]
-    if schema.SHUTTER_CLOSED not in str(flags.attrs.get("flag_meanings", "")).split():
-        return None  # of a file that does not tell
-    return schema.has_flag(flags, schema.SHUTTER_CLOSED)
+    flags, name = capture.get("frame_flags", xr.DataArray()), schema.SHUTTER_CLOSED
+    meanings = str(flags.attrs.get("flag_meanings", "")).split()  # a file need not tell
+    return schema.has_flag(flags, name) if name in meanings else None

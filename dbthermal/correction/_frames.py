@@ -13,8 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from dbthermal import _samples as samples
-from dbthermal import schema
+from dbthermal import _samples, schema
 from dbthermal._arrays import Array, Mask, stride
 from dbthermal.correction._nonuniformity import OUTLIER
 from dbthermal.correction._shutter import FEWEST_COPIES
@@ -22,6 +21,7 @@ from dbthermal.noise import MAD, MINIMUM_FRAMES
 
 Film = npt.NDArray[np.float32]
 Frames = npt.NDArray[np.int64]
+Means = list[Array]  # over parts of the image (time, part), of each band
 
 _PIXELS, _ROWS_AT_LEAST = 16384, 24  # of a band that are looked at, about
 _SAMPLES: Final = 2**24  # of a band, at most: of a long capture fewer pixels
@@ -95,10 +95,8 @@ def sampling(counts: xr.DataArray) -> dict[str, slice]:
     step = stride(shape, wanted)
     rows = -(-shape[0] * shape[1] // wanted)
     whole = wanted >= _ROWS_AT_LEAST * shape[1] or step == 1
-    return {
-        "y": slice(None, None, rows if whole else step),
-        "x": slice(None, None, 1 if whole else step),
-    }
+    steps = {"y": rows, "x": 1} if whole else {"y": step, "x": step}
+    return {dim: slice(None, None, size) for dim, size in steps.items()}
 
 
 def unreported(corrected: xr.Dataset, valid: Mask, renewals: Mask) -> Findings:
@@ -112,8 +110,7 @@ def unreported(corrected: xr.Dataset, valid: Mask, renewals: Mask) -> Findings:
     noise and usual motion, at once, for longer, and in one band. `renewals` (band, time) are first
     frames after events that are marked already.
 
-    Of 4e5 good frames of 48 kinds of scenes at 2, 10 and 50 Hz (people, pours, touches, flashes,
-    lamps, fans, knocks; cameras apart or late) less than 2e-4 are taken for bad ones.
+    Of 4e5 good frames of 48 kinds of scenes at 2 to 50 Hz less than 2e-4 are taken for bad ones.
     """
     counts = corrected["counts"]
     good = np.ones(counts.shape[2:], dtype=bool)
@@ -144,13 +141,7 @@ def unreported(corrected: xr.Dataset, valid: Mask, renewals: Mask) -> Findings:
 
 
 def _leave_out(
-    band: int,
-    film: Film,
-    sections: list[Array],
-    valid: Mask,
-    shutter: Mask,
-    noise: float,
-    longest: int,
+    band: int, film: Film, sections: Means, valid: Mask, shutter: Mask, noise: float, longest: int
 ) -> None:
     """Make bad frames of a band not valid (band, time), and mark those of a shutter (time)."""
     limit = np.float32(OUTLIER * np.sqrt(2.0) * noise)
@@ -187,7 +178,7 @@ def _leave_out(
 def _noise(film: Film) -> float:
     """Noise [count] of a film (time, y, x); NaN of too few frames."""
     flat = film.reshape(len(film), -1)
-    level = samples.noise(flat[:, :: stride((flat.shape[1],), 256)])
+    level = _samples.noise(flat[:, :: stride((flat.shape[1],), 256)])
     return float(np.median(level[level > 0.0])) if np.any(level > 0.0) else np.nan
 
 
@@ -237,7 +228,7 @@ def _changed(before: Film, after: Film, limit: np.float32) -> float:
     return float(np.mean(np.abs(after - before) > limit))
 
 
-def _is_shared(sections: list[Array], valid: Mask, band: int, places: Frames, span: Frames) -> bool:
+def _is_shared(sections: Means, valid: Mask, band: int, places: Frames, span: Frames) -> bool:
     """Return whether another band deviates alike, a few frames earlier or later, and as suddenly.
 
     Of the means of parts of the image (time, part); `places` are a frame and those that it deviates
@@ -275,7 +266,7 @@ def _is_sudden(section: Array, places: Frames, span: Frames, share: float) -> bo
     return bool(min(comes @ deviation, goes @ deviation) > share * energy and not drifts)
 
 
-def _usual_gain(band: int, film: Film, sections: list[Array], valid: Mask) -> Mask:
+def _usual_gain(band: int, film: Film, sections: Means, valid: Mask) -> Mask:
     """Frames (time) of the gain that most have, by noise with contrast, or with the pattern."""
     (frames,) = np.nonzero(valid[band])
     film, means, level = film[frames], sections[band][frames], np.zeros(valid.shape[1])
@@ -341,10 +332,9 @@ def _scores(detail: Film, valid: Mask, renewals: Mask) -> Array:
 
 
 def _change(detail: Film, valid: Mask, frame: int) -> tuple[Film, Array, float]:
-    """Change of the detail (pixel) at a frame, from mean to mean of the frames before and after.
+    """Change of the detail (pixel) at a frame, from mean to mean of the frames on both sides.
 
-    And the shares of it that each frame (time) brings, and that remains after as many frames more,
-    medians of the pixels that change most.
+    And the shares of it that each frame (time) brings, and that stays, where it changes most.
     """
     before, after = np.flatnonzero(valid[:frame])[::-1], frame + np.flatnonzero(valid[frame:])
     if min(before.size, after.size) == 0:

@@ -59,11 +59,10 @@ def blackbody_statistics(movies: xr.Dataset) -> xr.Dataset:
     >>> import numpy as np, xarray as xr
     >>> level = np.array([18000.0, 24000.0]).reshape(1, 2, 1, 1, 1)
     >>> counts = level + np.random.default_rng(1).normal(0, 4, (1, 2, 20, 16, 16))
-    >>> movies = xr.Dataset(
-    ...     {"counts": (("band", "temperature", "frame", "y", "x"), counts.astype(np.uint16))},
-    ...     {"band": ["8-14"], "temperature": [293.15, 333.15]},
-    ... )
-    >>> bool(abs(blackbody_statistics(movies).noise - 4.0).max() < 0.2)  # [count]
+    >>> films = (("band", "temperature", "frame", "y", "x"), counts.astype(np.uint16))
+    >>> axes = {"band": ["8-14"], "temperature": [293.15, 333.15]}
+    >>> statistics = blackbody_statistics(xr.Dataset({"counts": films}, axes))
+    >>> bool(abs(statistics.noise - 4.0).max() < 0.2)  # [count]
     True
     """
     counts = schema.check(movies, "blackbody_movies")["counts"]
@@ -126,10 +125,8 @@ def fit_correction(
         Stage `blackbody_frames` of `schema`: `counts` (band, temperature, y, x) [count] averaged
         over time, at two temperatures or more; optionally `noise` (band) [count] and the attribute
         ``frames``, as from `blackbody_statistics`.
-    threshold : float
-        Limit of the robust z-score [1].
-    maximum : int
-        Largest count of the detector [count].
+    threshold, maximum : float, int
+        Limit of the robust z-score [1]; largest count of the detector [count].
 
     Returns
     -------
@@ -149,11 +146,9 @@ def fit_correction(
     >>> sensitivity = np.random.default_rng(1).normal(1, 0.02, (8, 8))
     >>> sensitivity[3, 4] = 0.0
     >>> level = np.array([18000.0, 24000.0]).reshape(1, 2, 1, 1)  # [count]
-    >>> blackbody = xr.Dataset(
-    ...     {"counts": (("band", "temperature", "y", "x"), level * sensitivity)},
-    ...     {"band": ["8-14"], "temperature": [293.15, 333.15]},
-    ... )
-    >>> correction = fit_correction(blackbody)
+    >>> counts = (("band", "temperature", "y", "x"), level * sensitivity)
+    >>> axes = {"band": ["8-14"], "temperature": [293.15, 333.15]}
+    >>> correction = fit_correction(xr.Dataset({"counts": counts}, axes))
     >>> np.argwhere(correction.bad.values[0]).tolist(), bool(correction.residual < 1e-6)
     ([[3, 4]], True)
     """
@@ -208,12 +203,11 @@ def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
     good = ~correction["bad"].values
     if not np.all(schema.measured(flat.values[good])):
         raise ValueError("Invalid flat image: a good pixel is not finite. Must be finite.")
-    corrected = (
-        correction["gain"].values * flat.values.astype(np.float64) + correction["offset"].values
-    )
+    gain, offset = correction["gain"].values, correction["offset"].values
+    corrected = gain * flat.values.astype(np.float64) + offset
     # Offsets that bring every good pixel to the mean.
     level = np.mean(corrected, axis=(1, 2), where=good, keepdims=True)
-    offset = np.where(good, correction["offset"].values - (corrected - level), 0.0)
+    offset = np.where(good, offset - (corrected - level), 0.0)
     renewed = {"offset": correction["offset"].copy(data=offset)}
     if correction.keys() >= _PATTERN and "level" in correction:
         # The offset has the image's error, v, instead of that of n images, v / n.
@@ -235,10 +229,8 @@ def correct(
     ----------
     capture : Dataset
         Stage `capture` of `schema`, raw uint16. Other variables are handed on.
-    correction : Dataset
-        From `fit_correction`, of the same pixels; it may hold more bands.
-    maximum : int
-        Largest count of the detector [count].
+    correction, maximum : Dataset, int
+        From `fit_correction`, of the same pixels (it may hold more bands); largest count [count].
 
     Returns
     -------
@@ -247,9 +239,8 @@ def correct(
         bits DEAD_PIXEL (bad in a band) and SATURATED (a sample at `maximum` or above, or at 0, in a
         frame that has an exposure time) of `schema.Status`, whose counts are kept; `pattern_std`
         (band) [count] where the correction has its deviations, root mean square over the levels of
-        the capture. Attributes:
-        ``gain_offset_corrected`` = 1, or 0 where the camera does it, the parameters of the fit
-        (``gain_offset_...``), and the numbers of marked pixels.
+        the capture. Attributes: ``gain_offset_corrected`` = 1, or 0 where the camera does it, the
+        parameters of the fit (``gain_offset_...``), and the numbers of marked pixels.
     """
     counts = schema.check(capture, "capture")["counts"]
     if capture.attrs.get("gain_offset_corrected"):
@@ -309,10 +300,9 @@ def _pattern_std(correction: xr.Dataset, counts: xr.DataArray, good: Mask) -> xr
     offset, gain, centre = (
         correction[name].values[places] for name in ("offset_std", "gain_std", "centre")
     )
-    step = stride(counts.shape[1:], _LEVELS)
+    step, level = stride(counts.shape[1:], _LEVELS), np.full(len(names), np.nan)
     sample = counts[:, ::step, ::step, ::step].values.astype(np.float64)
     sample = sample[:, :, good[::step, ::step]]
-    level = np.full(len(sample), np.nan)
     if sample.size:
         level = np.square(sample - centre.reshape(-1, 1, 1)).mean(axis=(1, 2))
     std = np.sqrt(offset**2 + gain**2 * level)

@@ -10,8 +10,7 @@ import numpy.typing as npt
 import xarray as xr
 from scipy.ndimage import maximum_filter1d, median_filter
 
-from dbthermal import _numbers, _rows, schema
-from dbthermal import _samples as samples
+from dbthermal import _numbers, _rows, _samples, schema
 from dbthermal._arrays import Array, Mask
 from dbthermal._warnings import warned
 from dbthermal.correction._nonuniformity import OUTLIER, outlying
@@ -90,20 +89,17 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     >>> import numpy as np, xarray as xr
     >>> counts = np.random.default_rng(1).normal(20000, 4, (1, 60, 12, 12))  # [count]
     >>> counts[0, 30:40, 5, 7] += 80
-    >>> corrected = xr.Dataset(
-    ...     {"counts": (("band", "time", "y", "x"), counts)},
-    ...     {"band": ["8-14"], "time": np.arange(60) / 10.0},
-    ... )
-    >>> marked = mark_bad(corrected)
+    >>> axes = {"band": ["8-14"], "time": np.arange(60) / 10.0}
+    >>> capture = xr.DataArray(counts, axes, ("band", "time", "y", "x")).to_dataset(name="counts")
+    >>> marked = mark_bad(capture)
     >>> np.argwhere(marked.status.values).tolist(), marked.jumping_pixels
     ([[5, 7]], 1)
     """
     counts = schema.check_corrected(corrected)["counts"]
     threshold = _numbers.real_number("threshold of bad pixels", threshold, _numbers.POSITIVE)
     image = (counts.sizes["y"], counts.sizes["x"])
-    noisy, jumping, unjudged = (np.zeros(image, dtype=bool) for _ in range(3))
-    patterns: list[float] = []
-    stds = np.zeros(counts.sizes["band"])
+    noisy, jumping, unjudged = np.zeros((3, *image), dtype=bool)
+    patterns, stds = list[float](), np.zeros(counts.sizes["band"])
     if "pattern_std" in corrected:
         stds = np.nan_to_num(corrected["pattern_std"].values)
     # Frames within which a neighbour may change as well: those of 0.2 s, or five if more.
@@ -119,8 +115,8 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
         # Noise and mean picture of each pixel, some at a time.
         level, still = np.empty(image), np.empty((segments.size, *image))
         for window in _rows.windows(movie.shape, _BLOCK):
-            block = _samples(movie, *window)
-            level[window] = samples.noise(block)
+            block = _measured(movie, *window)
+            level[window] = _samples.noise(block)
             still[:, *window] = [_mean(block[segment_numbers == number]) for number in segments]
         judged = np.isfinite(level)
         if not judged.any():
@@ -143,24 +139,18 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
         jumping |= _jumps(movie, threshold * np.sqrt(2.0) * usual, stepped, reach)
     before = corrected["status"].values if "status" in corrected else np.zeros(image, np.uint32)
     status = before | (noisy | jumping) * np.uint32(Status.DEAD_PIXEL)
-    strong = [
-        f"{pattern:.3g} in band '{name}'"
-        for name, pattern in zip(corrected["band"].values, patterns, strict=True)
-        if pattern > _PATTERN
-    ]
-    return warned(
-        corrected.assign(
-            status=(("y", "x"), status, schema.status_attrs()),
-            pattern_std=("band", stds, schema.PATTERN_STD.attrs),
-        ),
-        *([_UNCORRECTED.format(", ".join(strong))] if strong else []),
-    ).assign_attrs(
-        noisy_pixels=int(noisy.sum()),
-        jumping_pixels=int(jumping.sum()),
-        unjudged_pixels=int(unjudged.sum()),
-        bad_threshold=threshold,
-        fixed_pattern=[round(pattern, 3) for pattern in patterns],
+    result = corrected.assign(
+        status=(("y", "x"), status, schema.status_attrs()),
+        pattern_std=("band", stds, schema.PATTERN_STD.attrs),
     )
+    # Warn of a strong pattern, and state what was found.
+    pairs = zip(corrected["band"].values, patterns, strict=True)
+    strong = [f"{std:.3g} in band '{name}'" for name, std in pairs if std > _PATTERN]
+    marked = {"noisy_pixels": noisy, "jumping_pixels": jumping, "unjudged_pixels": unjudged}
+    numbers = {name: int(mask.sum()) for name, mask in marked.items()}
+    fixed = [round(pattern, 3) for pattern in patterns]
+    result = warned(result, *([_UNCORRECTED.format(", ".join(strong))] if strong else []))
+    return result.assign_attrs(numbers, bad_threshold=threshold, fixed_pattern=fixed)
 
 
 def _mean(block: Single) -> Array:
@@ -182,13 +172,12 @@ def _pattern(image: Array) -> float:
 
 
 def mark_repeats(corrected: xr.Dataset, raw: xr.DataArray, *, shutter: bool) -> xr.Dataset:
-    """
-    Mark pixels that are clipped below the end of the raw counts, or frozen for a while.
+    """Mark pixels that are clipped below the end of the raw counts, or frozen for a while.
 
     Raw counts (band, time, y, x) are not rounded yet. Frames that are NaN in the corrected dataset
     do not count, and frozen pixels only where frames of a closed `shutter` were taken out.
     """
-    saturated, frozen = (np.zeros((raw.sizes["y"], raw.sizes["x"]), dtype=bool) for _ in range(2))
+    saturated, frozen = np.zeros((2, raw.sizes["y"], raw.sizes["x"]), dtype=bool)
     row = corrected["counts"].isel(y=slice(1)).values  # a frame is measured as a whole
     for movie, frames in zip(raw, np.isfinite(row).any(axis=(2, 3)), strict=True):
         clipped, still = _repeats(movie, frames)
@@ -209,29 +198,26 @@ def _repeats(movie: xr.DataArray, frames: Mask) -> tuple[Mask, Mask]:
     reach it are clipped.
     """
     image = (movie.sizes["y"], movie.sizes["x"])
-    step = max(1, image[1] // samples.PIXELS)
+    step = max(1, image[1] // _samples.PIXELS)
     middle = movie.isel(y=image[0] // 2, x=slice(None, None, step)).values
-    grain = samples.grain(middle, np.ones(middle.shape, dtype=bool))
-    clipped, frozen = np.zeros(image, dtype=bool), np.zeros(image, dtype=bool)
-    ends = np.zeros((2, 3, *image))
+    grain = _samples.grain(middle, np.ones(middle.shape, dtype=bool))
+    (clipped, frozen), ends = np.zeros((2, *image), dtype=bool), np.zeros((2, 3, *image))
     for rows, columns in _rows.windows(movie.shape, _BLOCK):
         counts = movie.isel(y=rows, x=columns).values.reshape(len(movie), -1)
         shape = (-1, columns.stop - columns.start)
         valid = np.broadcast_to(frames[:, np.newaxis], counts.shape)
-        still = samples.frozen(samples.repeated(counts, valid), grain.chance)
+        still = _samples.frozen(_samples.repeated(counts, valid), grain.chance)
         frozen[rows, columns] = still.reshape(shape)
         for highest in (False, True):
-            end, number = samples.end_of(counts, valid, highest=highest)
-            statistics = (end, number, samples.near_end(counts, valid, end, grain))
+            end, number = _samples.end_of(counts, valid, highest=highest)
+            statistics = (end, number, _samples.near_end(counts, valid, end, grain))
             ends[int(highest), :, rows, columns] = np.reshape(statistics, (3, *shape))
     moving = ends[0, 0] < ends[1, 0]
     for sign, (end, number, near) in zip((-1, 1), ends, strict=True):
-        clipped |= moving & samples.is_heap(number, near, grain)
+        clipped |= moving & _samples.is_heap(number, near, grain)
         level = end == sign * np.max(sign * end[moving], initial=-np.inf)
-        first = level.sum() - 1  # one sample of each makes its end
-        clipped |= level & samples.is_heap(
-            number[level].sum() - first, near[level].sum() - first, grain
-        )
+        many, about = (values[level].sum() + 1 - level.sum() for values in (number, near))
+        clipped |= level & _samples.is_heap(many, about, grain)  # one sample of each makes its end
     return clipped, frozen & moving
 
 
@@ -250,7 +236,7 @@ def _frames(movie: xr.DataArray, fewest: int) -> npt.NDArray[np.int64]:
     return np.flatnonzero(finite)
 
 
-def _samples(movie: xr.DataArray, rows: slice, columns: slice) -> Single:
+def _measured(movie: xr.DataArray, rows: slice, columns: slice) -> Single:
     """Counts of some rows and columns, NaN where they are no measurement."""
     counts = movie.isel(y=rows, x=columns).values
     return np.where(schema.measured(counts), counts, np.nan).astype(np.float32)
@@ -264,7 +250,7 @@ def _jumps(movie: xr.DataArray, limit: Array, stepped: Mask, reach: int) -> Mask
         (top, left), (bottom, right) = zip(*((it.start, it.stop) for it in window), strict=True)
         wide = slice(max(top - 1, 0), bottom + 1), slice(max(left - 1, 0), right + 1)
         inner = np.s_[top - wide[0].start :, left - wide[1].start :]
-        changes = _changes(_samples(movie, *wide), stepped)
+        changes = _changes(_measured(movie, *wide), stepped)
         for sign in (1.0, -1.0):
             change, total = (np.float32(sign) * difference for difference in changes)
             alone = _alone(change, total, limit[wide], reach)[inner]
@@ -291,11 +277,10 @@ def _changes(signal: Single, stepped: Mask) -> tuple[Single, Single]:
 
 def _alone(change: Single, total: Single, limit: Array, reach: int) -> Mask:
     """Pixels (y, x) that jump by more than their limit in a frame in which no neighbour does."""
-    shape = limit.shape
     nearby = maximum_filter1d(total, 2 * reach + 1, axis=0, mode="constant")
-    nearby = np.pad(nearby, ((0, 0), (1, 1), (1, 1)))
+    nearby, (rows, columns) = np.pad(nearby, ((0, 0), (1, 1), (1, 1))), limit.shape
     strongest = np.zeros_like(change)
     for y, x in _NEIGHBOURS:
-        np.maximum(strongest, nearby[:, y : y + shape[0], x : x + shape[1]], out=strongest)
+        np.maximum(strongest, nearby[:, y : y + rows, x : x + columns], out=strongest)
     single = (change > limit) & (strongest < _SHARED * change)
     return np.asarray(np.any(single[reach:-reach], axis=0))

@@ -60,10 +60,8 @@ def find_shutter(corrected: xr.Dataset, *, closed: xr.DataArray | None = None) -
     >>> import numpy as np, xarray as xr
     >>> counts = np.random.default_rng(1).normal(20000, 4, (1, 40, 8, 8)).round()  # [count]
     >>> counts[0, 21:26] = counts[0, 20]
-    >>> capture = xr.Dataset(
-    ...     {"counts": (("band", "time", "y", "x"), counts)},
-    ...     {"band": ["8-14"], "time": np.arange(40) / 10.0},
-    ... )
+    >>> axes = {"band": ["8-14"], "time": np.arange(40) / 10.0}
+    >>> capture = xr.DataArray(counts, axes, ("band", "time", "y", "x")).to_dataset(name="counts")
     >>> events = find_shutter(capture)
     >>> [events[name].item() for name in ("first_frame", "frames", "start", "stop", "renewed")]
     [21, 5, 2.1, 2.5, True]
@@ -73,10 +71,7 @@ def find_shutter(corrected: xr.Dataset, *, closed: xr.DataArray | None = None) -
 
 
 def events_of(
-    counts: xr.DataArray,
-    repeats: Mask,
-    closed: xr.DataArray | None,
-    steps: Mask | None = None,
+    counts: xr.DataArray, repeats: Mask, closed: xr.DataArray | None, steps: Mask | None = None
 ) -> xr.Dataset:
     """Events, as of `find_shutter`, of frames (band, time) that are copies or `closed`.
 
@@ -95,26 +90,19 @@ def events_of(
     places = () if steps is None else np.argwhere(steps)
     runs = [(str(counts["band"].values[band]), frame - 1, 2, True) for band, frame in places]
     for index, name in enumerate(counts["band"].values):
-        marked = shut[index] | repeats[index]
-        edges = np.diff(np.concatenate([[0], marked.astype(np.int64), [0]]))
-        for first, after in np.stack([np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)], 1):
+        marked = np.pad((shut[index] | repeats[index]).astype(np.int8), 1)
+        for first, after in np.flatnonzero(np.diff(marked)).reshape(-1, 2):
             renewed = bool(shut[index, first:after].any()) or after - first >= FEWEST_COPIES
             runs.append((str(name), first, after - first, renewed))
     # Rows of `find_shutter`, in the order of their starts.
     runs, time = sorted(runs, key=lambda run: run[1]), counts["time"].values.astype(np.float64)
     bands, first, number, renewals = zip(*runs, strict=True) if runs else ([], [], [], [])
-    start = np.array(first, dtype=np.int64)
-    stop = start + np.array(number, dtype=np.int64) - 1
-    return xr.Dataset(
-        {
-            "band": ("event", np.array(bands, dtype=str)),
-            "first_frame": ("event", start),
-            "frames": ("event", np.array(number, dtype=np.int64)),
-            "start": ("event", time[start], {"units": "s"}),
-            "stop": ("event", time[stop], {"units": "s"}),
-            "renewed": ("event", np.array(renewals, dtype=bool)),
-        }
-    )
+    start, frames = (np.array(column, dtype=np.int64) for column in (first, number))
+    rows: dict[str, Any] = {"band": ("event", np.array(bands, dtype=str))}
+    rows |= {"first_frame": ("event", start), "frames": ("event", frames)}
+    rows["start"] = ("event", time[start], {"units": "s"})
+    rows["stop"] = ("event", time[start + frames - 1], {"units": "s"})
+    return xr.Dataset({**rows, "renewed": ("event", np.array(renewals, dtype=bool))})
 
 
 def mark_shutter(corrected: xr.Dataset, events: xr.Dataset | None = None) -> xr.Dataset:
@@ -208,11 +196,8 @@ def distinct(capture: xr.Dataset) -> tuple[xr.Dataset, Mask]:
 
 def copies(counts: xr.DataArray) -> Mask:
     """Frames (band, time) of counts (band, time, y, x) that repeat the frame before."""
-    return np.stack([_copies(band) for band in counts])
-
-
-def _copies(counts: xr.DataArray) -> Mask:
-    """Frames (time) of one band, counts (time, y, x), that repeat the frame before."""
+    if "band" in counts.dims:
+        return np.stack([copies(band) for band in counts])
     step = stride((counts.sizes["y"], counts.sizes["x"]), _SAMPLE)
     sample = counts.isel(y=slice(None, None, step), x=slice(None, None, step)).values
     changed, valid = _changed(sample[:-1], sample[1:])

@@ -3,11 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
-from dbthermal import _numbers, _rows, schema
-from dbthermal import _smooth as smooth
+from dbthermal import _numbers, _rows, _smooth, schema
 from dbthermal import response as responses
 from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
@@ -133,16 +131,12 @@ def undo_drift(
         for values, curve in zip(level.values, curves, strict=True):
             frames = (segment == number) & np.isfinite(values)
             if frames.any():
-                functions = smooth.polynomial_basis(time[frames], min(order, int(frames.sum())))
+                functions = _smooth.polynomial_basis(time[frames], min(order, int(frames.sum())))
                 fitted = functions @ (functions.T @ values[frames])
                 curve[frames] = fitted - fitted[0]  # change since the segment's first frame
 
-    def undone(window: slice) -> npt.NDArray[np.floating]:
-        """Counts of some rows without the drift."""
-        values = counts.isel(y=window).values
-        return np.asarray(values - curves[..., np.newaxis, np.newaxis], dtype=values.dtype)
-
-    undo = _rows.lazy(undone, counts) if lazy else counts.copy(data=undone(slice(None)))
+    drifts = curves[..., np.newaxis, np.newaxis]
+    undo = _rows.changed(counts, lambda values: values - drifts, lazy=lazy)
     drift = schema.variables("corrected", {"drift": curves})
     return corrected.assign(counts=undo, **drift).assign_attrs(
         drift_order=order, drift_pixels=len(rows)
@@ -184,14 +178,11 @@ class Reference:
 
     Attributes
     ----------
-    response : Dataset
-        Stage `response` of `schema`: the counts that a patch should have.
-    patches : DataArray
-        True at the pixels of each patch, (patch, y, x), bool.
-    temperatures : tuple of float
-        Of each patch, mean over the capture [K]; two or more differ.
-    temperature_std : float
-        Standard deviation of the error that they share [K].
+    response, patches : Dataset, DataArray
+        Stage `response` of `schema`: the counts that a patch should have; True at the pixels of
+        each patch, (patch, y, x), bool.
+    temperatures, temperature_std : tuple of float, float
+        Of each patch, mean over the capture [K]; two or more differ. Deviation that they share [K].
     """
 
     response: xr.Dataset
@@ -241,12 +232,7 @@ def refer(corrected: xr.Dataset, reference: Reference, *, lazy: bool) -> xr.Data
             scatter = np.sum((temperatures - temperatures.mean()) ** 2)
             remaining[names[band]]["gain_std"] = float(np.sqrt(np.mean(errors**2) / scatter))
 
-    def referred(window: slice) -> npt.NDArray[np.floating]:
-        """Counts of some rows on the line."""
-        values = counts.isel(y=window).values
-        return np.asarray(lines[0] * values + lines[1], dtype=values.dtype)
-
-    result = _rows.lazy(referred, counts) if lazy else counts.copy(data=referred(slice(None)))
+    result = _rows.changed(counts, lambda values: lines[0] * values + lines[1], lazy=lazy)
     level = {"temperature": float(temperatures.mean()), "std": reference.temperature_std}
     return corrected.assign(counts=result).assign_attrs(
         level_reference={**level, "bands": remaining}

@@ -7,8 +7,7 @@ from typing import Final
 import numpy as np
 import xarray as xr
 
-from dbthermal import _numbers, planck, schema
-from dbthermal import _text as texts
+from dbthermal import _numbers, _text, planck, schema
 from dbthermal._arrays import Array
 from dbthermal.bands import FILTERS, Band, get
 
@@ -57,10 +56,9 @@ def band_table(
         Material to stage `spectrum` of `schema`: `emissivity` (wavelength) [1], wavelength [m].
     bands : mapping or iterable of Band or str
         Bands, or names of `bands.FILTERS`.
-    temperature : float
-        Temperature of the material [K].
-    minimum_coverage : float
-        Share of the band's blackbody radiance that each spectrum must cover, in (0, 1].
+    temperature, minimum_coverage : float
+        Temperature of the material [K]; share, in (0, 1], of the band's blackbody radiance that
+        each spectrum must cover.
 
     Returns
     -------
@@ -134,7 +132,7 @@ def embedded_table() -> xr.Dataset:
     names = ["material", "library", "source"]
     if titles != [*names, *FILTERS, "coverage_8_14"]:
         raise ValueError(f"Invalid columns {titles} of '{_TABLE}'. Must be those of the filters.")
-    values = texts.numbers([(line, row[3:]) for line, row in rows], len(FILTERS) + 1, _TABLE)
+    values = _text.numbers([(line, row[3:]) for line, row in rows], len(FILTERS) + 1, _TABLE)
     # The four filters end at 12.35 um: every spectrum of the table covers them whole.
     coverage = np.ones_like(values[:, :-1])
     coverage[:, list(FILTERS).index(CAMERA_BAND)] = values[:, -1]
@@ -176,7 +174,7 @@ def library_mixture(bands: Iterable[str]) -> xr.Dataset:
             "each once, when the capture is made; or give a prior on the emissivities."
         )
     titles, rows = _packaged(_MIXTURE)
-    count, values = len(FILTERS), texts.numbers(rows, len(titles), _MIXTURE)
+    count, values = len(FILTERS), _text.numbers(rows, len(titles), _MIXTURE)
     covariance = np.zeros((len(values), count, count))
     i, j = np.tril_indices(count)
     covariance[:, i, j] = covariance[:, j, i] = values[:, 1 + count :]
@@ -194,10 +192,10 @@ def library_mixture(bands: Iterable[str]) -> xr.Dataset:
     return xr.Dataset(variables, {"band": names, "other": names})
 
 
-def _packaged(name: str) -> tuple[list[str], list[texts.Row]]:
+def _packaged(name: str) -> tuple[list[str], list[_text.Row]]:
     """Titles and rows of a table that comes with the package."""
     with resources.as_file(resources.files("dbthermal.emissivity").joinpath(name)) as path:
-        (_, titles), *rows = texts.table_rows(texts.read_text(path), name, comment="#")
+        (_, titles), *rows = _text.table_rows(_text.read_text(path), name, comment="#")
     return titles, rows
 
 
@@ -289,10 +287,6 @@ def filter_noise(netd: float, bands: Bands) -> xr.DataArray:
     chosen = chosen_bands(bands)
     netd = _numbers.real_number("netd [K]", netd, _numbers.POSITIVE)
     slopes = np.array([float(band.slope(_TEMPERATURE)) for band in chosen])
-    return xr.DataArray(
-        netd * slopes[0] / slopes,
-        coords={"band": [band.name for band in chosen]},
-        dims="band",
-        name="noise",
-        attrs={"units": "K", "long_name": "noise-equivalent temperature difference"},
-    )
+    noise, axes = netd * slopes[0] / slopes, {"band": [band.name for band in chosen]}
+    attrs = {"units": "K", "long_name": "noise-equivalent temperature difference"}
+    return xr.DataArray(noise, axes, "band", "noise", attrs)

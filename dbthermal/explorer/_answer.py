@@ -20,23 +20,16 @@ _COMMON: Final = 0.02  # share of the pixels from which a material is listed
 # Of a material by band: with its deviation, and with that in steady surroundings.
 _EMISSIVITIES: Final = ("emissivity", "emissivity_std", "emissivity_steady_std")
 _DOUBTED: Final = 0.05  # share of the pixels from which a flag is listed
+_NEAREST: Final = 3  # materials that are named
 
 
 def answer(result: xr.Dataset, materials: xr.Dataset | None = None) -> tuple[list[str], Any]:
     """Sentences on a result for whoever asks how hot it is and how sure, and their numbers.
 
-    Parameters
-    ----------
-    result : Dataset
-        Stage `separated`, also a lazy one: some rows and frames of its films are read.
-    materials : Dataset, optional
-        Stage `emissivity_table`; `emissivity.embedded_table` if not given.
-
-    Returns
-    -------
-    list of str, dict
-        Sentences, and `object_temperature_degC` (two), `object_temperature_std_K`, by cause,
-        `measured` and `completed` as shares of the pixels, and the list `materials`.
+    Of a result that may be lazy, some rows and frames are read; materials are of the stage
+    `emissivity_table`, `emissivity.embedded_table` by default. The numbers are
+    `object_temperature_degC` (two), `object_temperature_std_K`, by cause, `measured` and
+    `completed` as shares of the pixels, and the list `materials`.
     """
     table = emissivity.embedded_table() if materials is None else materials
     height, width = result.sizes["y"], result.sizes["x"]
@@ -155,14 +148,12 @@ def by_material(result: xr.Dataset, measured: Mask, table: xr.Dataset) -> list[d
     return sorted(listed, key=lambda entry: -entry["pixels"])
 
 
-def nearest(
-    bands: list[str], values: Array, stds: Array, table: xr.Dataset, number: int = 3
-) -> list[dict[str, Any]]:
+def nearest(bands: list[str], values: Array, stds: Array, table: xr.Dataset) -> list[Any]:
     """Materials of a table that are nearest to emissivities (band), and how far they are."""
     if not {*bands} <= {*table["band"].values} or not np.isfinite(values + stds).all():
         return []
     far, names = distance(bands, values, stds, table), table["material"].values
-    order = np.argsort(far)[:number]
+    order = np.argsort(far)[:_NEAREST]
     return [{"material": str(names[at]), "distance": float(far[at])} for at in order]
 
 

@@ -15,7 +15,7 @@ from matplotlib.patches import Ellipse, Patch, Polygon, Rectangle
 from PIL import Image
 
 from dbthermal import figures, store
-from dbthermal.explorer._regions import Region
+from dbthermal.explorer._films import Region
 from dbthermal.explorer._view import Pixels, View
 from dbthermal.figures import drawing
 from dbthermal.figures._maps import legend
@@ -156,9 +156,8 @@ def save(view: View, path: str | Path, shown: Shown) -> None:
     elif path.suffix == ".tiff":
         pane = view.pane(name)
         text = f"{pane.label} [{pane.units}] at {view.time[index]:.3f} s"
-        Image.fromarray(view.frame(name, index)).save(
-            path, tiffinfo={270: text.encode("ascii", "ignore")}
-        )
+        tags = {270: text.encode("ascii", "ignore")}  # the description
+        Image.fromarray(view.frame(name, index)).save(path, tiffinfo=tags)
     else:
         result = xr.Dataset(attrs={"time": float(view.time[index])})
         for pane_name in shown.names:

@@ -17,13 +17,16 @@ from dbthermal.explorer._films import (
     FILMS,
     Pane,
     Progress,
+    Region,
     Values,
+    common_gain,
     input_panes,
     marks,
+    mean_std,
     opened,
     result_panes,
+    statistics,
 )
-from dbthermal.explorer._regions import Region, common_gain, mean_std, statistics
 from dbthermal.schema import Status
 
 Pixels = Literal["unflagged", "measured", "all"]
@@ -39,15 +42,17 @@ class View:
     Films that are not in memory are copied into a temporary file (``TMPDIR``) when they are first
     read: 4 bytes a pixel and frame on disk, and in memory a row of a store's chunks.
 
+    TypeError if the data are neither a Dataset nor a path; ValueError if there is no temperature
+    and no counts, a variable is not as `schema` says, the capture has other frames, pixels or
+    bands, or an event is not at a finite time.
+
     Parameters
     ----------
     data : Dataset, str or Path
         Result of `separation` with `object_temperature` (time, y, x) [K] and what else it has, or a
         capture with `counts` (band, time, y, x) [count]; or the store of one.
-    capture, response : Dataset, str or Path, optional
+    capture, response, events : optional
         As in `explore`.
-    events : mapping of str to float, optional
-        Name to time [s].
 
     Attributes
     ----------
@@ -55,20 +60,10 @@ class View:
         What can be shown: ``input 9.5`` for each band, ``object_temperature``,
         ``background_temperature``, ``emissivity 9.5``, each with ``_std``, and ``status``. What a
         method does not estimate is left out.
-    time : ndarray
-        Time of each frame [s].
-    shape : tuple of int
-        Rows and columns.
+    time, shape : ndarray, tuple of int
+        Time of each frame [s]; rows and columns.
     events : dict of str to float
         Name to time [s], with what segments and frame flags of the capture say.
-
-    Raises
-    ------
-    TypeError
-        If the data are neither a Dataset nor a path.
-    ValueError
-        If there is no temperature and no counts, a variable is not as `schema` says, the capture
-        has other frames, pixels or bands, or an event is not at a finite time.
 
     Examples
     --------
@@ -187,12 +182,14 @@ class View:
         .. math:: s^2 = \left(\frac1n \sum_i k_i\right)^2 + \left(\frac1n \sum_i c_i\right)^2
                   + \frac1{n^2} \sum_i (s_i^2 - k_i^2 - c_i^2)
 
+        The deviations exclude the correlation of neighbours by interpolation. That of the reflected
+        temperature is mostly the prior of its drift (`SubspaceSettings.background_drift`): without
+        a drift the mean is much closer.
+
         Parameters
         ----------
-        name : str
-            One of `panes`, but "status"; ValueError for another one.
-        region : Region
-            Region of the image; ValueError without a pixel.
+        name, region : str, Region
+            One of `panes`, but "status"; region of the image. ValueError for another, or no pixel.
         pixels : {"unflagged", "measured", "all"}
             Which pixels count; see `counted`.
 
@@ -202,12 +199,6 @@ class View:
             `mean`, `minimum`, `maximum`, `std` in the pane's units, its part `calibration_std`, and
             `pixels`, the number that counts, over (time); without it for a map. NaN where no pixel
             counts. `std` is NaN where the result states no deviation.
-
-        Notes
-        -----
-        The deviations exclude the correlation of neighbours by interpolation. That of the reflected
-        temperature is mostly the prior of its drift (`SubspaceSettings.background_drift`): without
-        a drift the mean is much closer.
         """
         pane, mask = self.pane(name), region.mask(self.shape)
         if pane.kind == "status":
@@ -293,12 +284,9 @@ class View:
     def _noise(self, pane: Pane, values: Values) -> Array:
         """Noise of the samples of a band, with what is left of its pattern; NaN if not known."""
         assert self.capture is not None
-        holders = (self.response, self.data)
-        noise = next(
-            (holder["noise"] for holder in holders if holder is not None and "noise" in holder),
-            None,
-        )
-        if noise is None:
+        holders = [holder for holder in (self.response, self.data) if holder is not None]
+        stated = [holder["noise"] for holder in holders if "noise" in holder]
+        if not stated:
             return np.full(values.shape, np.nan)
         band = pane.name.removeprefix("input ")
 
@@ -307,7 +295,7 @@ class View:
 
         factor = of(self.capture["noise_factor"]) if "noise_factor" in self.capture else 1.0
         pattern = of(self.capture["pattern_std"]) if "pattern_std" in self.capture else 0.0
-        std = np.hypot(of(noise) * factor, pattern)
+        std = np.hypot(of(stated[0]) * factor, pattern)
         if pane.curve is None:
             return np.full(values.shape, std)
         return np.asarray(std / pane.curve.count_slope(values))

@@ -16,15 +16,13 @@ from matplotlib import colormaps
 from dbthermal import schema
 from dbthermal._arrays import Mask
 from dbthermal.explorer import _export
-from dbthermal.explorer._films import FILMS, Values
-from dbthermal.explorer._regions import Region
+from dbthermal.explorer._films import FILMS, Region, Values
 from dbthermal.explorer._view import COMPLETED, View
 from dbthermal.figures import drawing
 from dbthermal.figures._maps import legend
 
 PALETTES: Final = ("inferno", "cividis", "gray", "gnuplot2", "turbo")
 _DPI: Final = 80
-_HERE: Final = Path(__file__).parent
 _REFUSED: Final = (ArithmeticError, LookupError, MemoryError, OSError, TypeError, ValueError)
 
 
@@ -49,21 +47,16 @@ class Explorer(anywidget.AnyWidget):
 
     Parameters
     ----------
-    view : View
-        What is shown.
-    celsius : bool
-        Degrees Celsius instead of kelvin.
+    view, celsius : View, bool
+        What is shown; True for degrees Celsius instead of kelvin.
 
     Attributes
     ----------
-    view : View
-        What is shown.
-    regions : dict of str to Region
-        Regions by name, as they are drawn.
+    view, regions : View, dict of str to Region
+        What is shown, and regions by name, as they are drawn.
     """
 
-    _esm = _HERE / "explorer.js"
-    _css = _HERE / "explorer.css"
+    _esm, _css = (Path(__file__).with_name(f"explorer.{kind}") for kind in ("js", "css"))
 
     def __init__(self, view: View, *, celsius: bool = True) -> None:
         self.view = view
@@ -127,11 +120,8 @@ class Explorer(anywidget.AnyWidget):
         codes, entries = legend(xr.DataArray(view.status))
         panes = [
             {
-                "name": pane.name,
-                "label": pane.label,
+                **{key: getattr(pane, key) for key in ("name", "label", "kind", "absolute")},
                 "units": pane.units if pane.units != "1" else "",
-                "kind": pane.kind,
-                "absolute": pane.absolute,
                 "shown": "_std" not in pane.name or pane.name == f"{next(iter(FILMS))}_std",
             }
             for pane in view.panes.values()

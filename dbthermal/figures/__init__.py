@@ -8,11 +8,12 @@ which is as wide as a page at most, with letters of 7 points, and save as PDF (`
 """
 
 from dbthermal.figures import drawing
-from dbthermal.figures._live import Panel, live
 from dbthermal.figures._maps import REASONS, plan, status
 from dbthermal.figures._scenes import (
     FilmPanel,
+    Panel,
     film,
+    live,
     reflection_shift,
     separated_frames,
     separated_temperatures,

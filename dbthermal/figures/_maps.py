@@ -7,10 +7,8 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
-from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, to_rgb
 from matplotlib.figure import Figure
-from matplotlib.image import AxesImage
 from matplotlib.patches import Patch
 
 from dbthermal import schema
@@ -42,10 +40,23 @@ def plan(expected: xr.Dataset, durations: xr.Dataset, materials: Sequence[str]) 
     std = expected["object_temperature_std"]
     size = (7.8 + 0.75 * std.sizes["filter"], max(4.2, 0.24 * std.sizes["material"] + 1.9))
     figure, ((map_axis, bar_axis),) = canvas(1, 2, size)
-    drawn = _map(map_axis, std, expected["best"])
+    values, names = std.where(np.isfinite(std)).values, std["filter"].values.tolist()
+    drawn = map_axis.imshow(values, cmap="viridis_r", norm=LogNorm(*_SCALE), aspect="auto")
+    map_axis.set_facecolor("0.8")
+    # Number of each cell, the best of a row framed.
+    for row, column in np.ndindex(*values.shape):
+        value, framed = values[row, column], expected["best"].values[row] == names[column]
+        text = f"{value:.2g}" if np.isfinite(value) else "\N{EM DASH}"
+        color = "white" if value > np.sqrt(_SCALE[0] * _SCALE[1]) else "black"
+        frame = {"boxstyle": "round,pad=0.2", "fill": False, "edgecolor": color}
+        style: dict[str, Any] = {"color": color, "fontsize": 8, "ha": "center", "va": "center"}
+        map_axis.text(column, row, text, bbox=frame if framed else None, **style)
+    map_axis.set_xticks(range(len(names)), names, fontsize=8)
+    map_axis.set_yticks(range(len(values)), std["material"].values.tolist(), fontsize=8)
     bar = figure.colorbar(drawn, ax=map_axis, label="expected std [K]", shrink=0.8, extend="both")
     plain_decades(bar.ax)
     map_axis.set_xlabel(f"filter beside {expected.attrs['beside']} [{_MICRO}]")
+    # Lines of the materials over the length.
     best = expected["best"].sel(material=list(materials))
     filtered = best[np.isin(best.values, std["filter"].values)]
     for index, name in enumerate(filtered["material"].values):
@@ -64,24 +75,6 @@ def plan(expected: xr.Dataset, durations: xr.Dataset, materials: Sequence[str]) 
     title = "Object temperature of one pixel, expected standard deviation"
     figure.suptitle(title + drawing.provenance_note(expected))
     return figure
-
-
-def _map(axis: Axes, std: xr.DataArray, best: xr.DataArray) -> AxesImage:
-    """Map of deviations (material, filter) with numbers, the best of each row framed."""
-    values = np.where(np.isfinite(std.values), std.values, np.nan)
-    drawn = axis.imshow(values, cmap="viridis_r", norm=LogNorm(*_SCALE), aspect="auto")
-    axis.set_facecolor("0.8")
-    names = std["filter"].values.tolist()
-    for row, column in np.ndindex(*values.shape):
-        value, framed = values[row, column], best.values[row] == names[column]
-        text = f"{value:.2g}" if np.isfinite(value) else "\N{EM DASH}"
-        color = "white" if value > np.sqrt(_SCALE[0] * _SCALE[1]) else "black"
-        frame = {"boxstyle": "round,pad=0.2", "fill": False, "edgecolor": color}
-        style: dict[str, Any] = {"color": color, "fontsize": 8, "ha": "center", "va": "center"}
-        axis.text(column, row, text, bbox=frame if framed else None, **style)
-    axis.set_xticks(range(len(names)), names, fontsize=8)
-    axis.set_yticks(range(len(values)), std["material"].values.tolist(), fontsize=8)
-    return drawn
 
 
 REASONS: Final = MappingProxyType(

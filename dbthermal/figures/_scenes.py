@@ -1,7 +1,8 @@
-"""Figures and films of separated scenes."""
+"""Figures and films of scenes: separated, and while they are recorded."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from textwrap import fill
 from typing import Any, Final
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy.typing as npt
 import xarray as xr
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from scipy.constants import zero_Celsius
 
 from dbthermal import schema
@@ -16,9 +18,14 @@ from dbthermal._coordinates import laid_on
 from dbthermal.figures import drawing
 from dbthermal.figures.drawing import band_label, canvas, draw_image, limits_of
 
-_WIDTH: Final = 3.2
-
-_DPI: Final = 100
+_WIDTH, _DPI = 3.2, 100  # of a picture of a film [inch], and dots of an inch
+_LIVE_WIDTH: Final = 4.8  # of a picture of a recording [inch]
+_TEXT_HEIGHT: Final = 1.15  # of title, lines and foot [inch]
+_BAR: Final = 0.76  # of its width that a picture takes, beside the colour bar
+_LETTERS: Final = 75  # of a line of the foot, per picture
+_TICKS: Final = 4  # intervals of the colour bar at most: every number costs a millisecond
+_ALARM: Final = "#b3001b"
+_BOX: Final = {"facecolor": "white", "edgecolor": _ALARM, "alpha": 0.85, "pad": 3.0}
 
 
 def separated_frames(
@@ -37,10 +44,8 @@ def separated_frames(
         (band, time, y, x), any unit.
     emission, reflection : DataArray
         (time, y, x); pixels without a value are gray.
-    title : str
-        Name of the scene.
-    labels : tuple of str
-        Labels with units of inputs, emission and reflection.
+    title, labels : str, tuple of str
+        Name of the scene; labels with units of inputs, emission and reflection.
     """
     emission = laid_on(emission, inputs, "the emission", "the inputs")
     reflection = laid_on(reflection, inputs, "the reflection", "the inputs")
@@ -80,8 +85,7 @@ def separated_temperatures(
     apparent, emission : DataArray
         Temperature of the inputs (band, time, y, x), and of the object (time, y, x) [K].
     change : DataArray
-        Background temperature less its mean over time, or the change that it
-        causes (time, y, x) [K].
+        Background temperature less its mean over time, or what it changes (time, y, x) [K].
     title, label : str
         Name of the scene; label of the change, with its unit.
 
@@ -126,9 +130,8 @@ def reflection_shift(field: xr.Dataset) -> Figure:
                 place.contourf(extrapolated.values, [0.5, 1.5], colors="none", hatches=["///"])
     bands = ", ".join(band_label(name) for name in np.atleast_1d(field.attrs["bands"]))
     reference = band_label(field.attrs["reference_band"])
-    figure.suptitle(
-        f"Reflection of {bands} in the picture of {reference}" + drawing.provenance_note(field)
-    )
+    heading = f"Reflection of {bands} in the picture of {reference}"
+    figure.suptitle(heading + drawing.provenance_note(field))
     return figure
 
 
@@ -142,12 +145,9 @@ class FilmPanel:
         (time, y, x); pixels without a value are gray.
     title, unit : str
         Title, and unit of the colour bar.
-    symmetric : bool
-        Zero in the middle of the range of colour.
-    limits : (float, float), optional
-        Range of colour, in place of that of the values.
-    palette : str
-        Colours, by their name in matplotlib.
+    symmetric, limits, palette : bool, (float, float) or None, str
+        Zero in the middle of the range of colour; that range, in place of the values' own; colours,
+        by their name in matplotlib.
     """
 
     values: xr.DataArray
@@ -163,10 +163,8 @@ def film(panels: Sequence[FilmPanel], *, title: str) -> Iterator[npt.NDArray[np.
 
     Parameters
     ----------
-    panels : sequence of FilmPanel
-        Of the same times and pixels.
-    title : str
-        Heading, which the time follows.
+    panels, title : sequence of FilmPanel, str
+        Of the same times and pixels; heading, which the time follows.
 
     Yields
     ------
@@ -199,3 +197,61 @@ def film(panels: Sequence[FilmPanel], *, title: str) -> Iterator[npt.NDArray[np.
             image.axes.draw_artist(image)
         figure.draw_artist(heading)
         yield np.asarray(sheet.buffer_rgba())[..., :3].copy()
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """Picture and texts of one band, or of one temperature.
+
+    Attributes
+    ----------
+    image, is_temperature : array, bool
+        Raw signal (y, x) [count] of a band, or a temperature [degree Celsius]; NaN is gray.
+    limits, text, warning : tuple of float, str, str
+        Values at both ends of the colours; texts below and across the picture.
+    """
+
+    image: npt.NDArray[Any]
+    limits: tuple[float, float]
+    text: str
+    warning: str = ""
+    is_temperature: bool = False
+
+
+def live(panels: Mapping[str, Panel], *, title: str, foot: str = "") -> Figure:
+    """Figure of the last frames of a recording, side by side.
+
+    Parameters
+    ----------
+    panels : mapping of str to Panel
+        Band, or name of a temperature, to its picture; all of one shape.
+    title, foot : str
+        Texts above and below, which belong to no picture.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> figure = live({"9.5": Panel(np.zeros((24, 32)), (0, 1), "no frame yet")}, title="pot")
+    >>> figure.axes[0].get_xlabel()
+    'no frame yet'
+    """
+    rows, columns = next(iter(panels.values())).image.shape
+    height = _BAR * _LIVE_WIDTH * rows / columns + _TEXT_HEIGHT
+    figure, axes = canvas(1, len(panels), (_LIVE_WIDTH * len(panels), height))
+    for axis, (name, panel) in zip(axes[0], panels.items(), strict=True):
+        # The picture, with few whole numbers at its colour bar.
+        shown = name, "temperature [\N{DEGREE SIGN}C]", "inferno"
+        if not panel.is_temperature:
+            shown = band_label(name), "raw signal [count]", "gray"
+        image, (heading, label, cmap) = xr.DataArray(panel.image, dims=("y", "x")), shown
+        draw_image(figure, axis, image, heading, label, cmap=cmap, limits=panel.limits)
+        bar = axis.images[0].colorbar
+        bar.locator, bar.formatter = MaxNLocator(_TICKS, integer=True), ScalarFormatter()
+        # Its texts.
+        axis.set_xlabel(panel.text, loc="left", fontsize=9)
+        if panel.warning:
+            place: dict[str, Any] = {"transform": axis.transAxes, "va": "top", "fontsize": 9}
+            axis.text(0.02, 0.97, panel.warning, color=_ALARM, bbox=_BOX, **place)
+    figure.suptitle(title)
+    figure.supxlabel(fill(foot, _LETTERS * len(panels)), fontsize=9)
+    return figure

@@ -87,10 +87,8 @@ def draw_image(
 
     Parameters
     ----------
-    figure, axis : Figure, Axes
-        Where to draw.
-    image : DataArray
-        (y, x).
+    figure, axis, image : Figure, Axes, DataArray
+        Where to draw; image (y, x).
     title, label, cmap : str
         Title, label of the colour bar with its unit, and colour map.
     limits : tuple of float, optional
@@ -108,10 +106,8 @@ def limits_of(image: xr.DataArray, *, symmetric: bool = False) -> tuple[float, f
 
     Parameters
     ----------
-    image : DataArray
-        Values, of any shape and unit.
-    symmetric : bool
-        Make the range symmetric about zero.
+    image, symmetric : DataArray, bool
+        Values, of any shape and unit; True for a range that is symmetric about zero.
     """
     values = image.values[np.isfinite(image.values)]
     if values.size == 0:
@@ -141,16 +137,6 @@ def plain_decades(axis: Axes) -> None:
     axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axis.yaxis.set_minor_locator(NullLocator())
-
-
-def number_cells(
-    axis: Axes, values: npt.NDArray[np.floating], middle: float, form: str, **style: Any
-) -> None:
-    """Write the finite values (row, column) of a map on it, white where they are above a middle."""
-    for row, column in np.argwhere(np.isfinite(values)):
-        color = "white" if values[row, column] > middle else "black"
-        text = form.format(values[row, column])
-        axis.text(column, row, text, ha="center", va="center", color=color, **style)
 
 
 def percent(share: float) -> str:

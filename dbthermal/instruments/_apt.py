@@ -230,13 +230,6 @@ class Decoder:
     the next. Each received byte belongs to a message that was returned, is counted in `dropped`, or
     is `pending`. The fewer `destinations` and `sources` are possible, the less noise passes for a
     message; by default all are, so that a line is read in both directions.
-
-    Examples
-    --------
-    >>> decoder = Decoder()
-    >>> [message] = decoder.feed(bytes.fromhex("ff 44 04 01 00 01 21"))
-    >>> Id(message.id).name, decoder.dropped
-    ('MOT_MOVE_HOMED', 1)
     """
 
     destinations: Collection[int] = CONTROLLERS | {HOST}
@@ -296,7 +289,7 @@ class Controller:
         self._transport, self._clock = transport, transport.clock
         # A recorder asks for the position in one thread while another turns the wheel.
         self._lock = threading.Lock()
-        self._ended: set[tuple[int, int]] = set()  # identifier and source of ends of a motion
+        self.ended = set[int]()  # what the motor reported since the last start of a motion
         self._notices: list[str] = []  # a sentence each
 
     def connect(self) -> Info:
@@ -326,13 +319,9 @@ class Controller:
         """Send the start of a motion, once earlier ends are forgotten; WheelError as `check`."""
         with self._clock.hold(self._lock):
             self._collect()
-        self._ended.clear()
+        self.ended.clear()
         self.check()
         self.send(identifier, channel, data=data)
-
-    def has_reported(self, identifier: Id) -> bool:
-        """True if the motor reported this since the last start of a motion."""
-        return (identifier, self.motor) in self._ended
 
     def check(self) -> None:
         """WheelError with the text of the errors that the controller reported by itself."""
@@ -387,7 +376,7 @@ class Controller:
         for message in self.decoder.feed(received):
             match message.id:
                 case Id.MOT_MOVE_COMPLETED | Id.MOT_MOVE_STOPPED | Id.MOT_MOVE_HOMED:
-                    self._ended.add((message.id, message.source))
+                    self.ended |= {message.id} if message.source == self.motor else set()
                 case Id.HW_RESPONSE | Id.HW_RICHRESPONSE:
                     error = parse(Notice, message) if message.data else Notice()
                     about = f"error {error.code} of message 0x{error.id:04X}"

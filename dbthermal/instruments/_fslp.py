@@ -57,11 +57,6 @@ def encode(
     """Bytes of a frame; header, data and checksum are all escaped.
 
     TypeError or ValueError if a number does not fit its field, or the data are too long.
-
-    Examples
-    --------
-    >>> encode(1, 0x00050002).hex(" ")  # serial number of a Boson
-    '8e 00 00 00 00 01 00 05 00 02 ff ff ff ff 01 0b ae'
     """
     numbers = {"channel": channel, "sequence number": sequence, "command": command}
     for name, value in {**numbers, "status": status}.items():
@@ -92,15 +87,6 @@ class Decoder:
     Bytes between frames are ignored. A start byte always begins anew. A frame that is cut short,
     too long or too short, holds an illegal escape or has the wrong checksum is dropped and counted
     in `damaged`: each start byte began a frame that was returned, is counted, or is still open.
-
-    Examples
-    --------
-    >>> line, decoder = encode(1, 0x00050002), Decoder()
-    >>> decoder.feed(b"noise" + line[:9])
-    []
-    >>> [frame] = decoder.feed(line[9:])
-    >>> frame.sequence, hex(frame.command), decoder.damaged
-    (1, '0x50002', 0)
     """
 
     def __init__(self) -> None:

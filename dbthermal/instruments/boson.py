@@ -22,8 +22,7 @@ from typing import Any, Final, Generic, TypeVar
 
 from scipy.constants import zero_Celsius
 
-from dbthermal.instruments import _fslp as fslp
-from dbthermal.instruments import telemetry, v4l2
+from dbthermal.instruments import _fslp, telemetry, v4l2
 from dbthermal.instruments.camera import CameraKind, FfcMode, FfcStatus, GainMode, Identity
 from dbthermal.instruments.transport import Closing, Transport
 
@@ -158,15 +157,6 @@ class Boson(Closing):
     Each method raises `BosonTimeoutError` if no reply comes, `BosonError` if a wrong one does or
     the camera refuses, and `TransportError` if it is gone. A reading is requested again if no reply
     comes; a command that changes the camera never is.
-
-    Examples
-    --------
-    >>> from dbthermal.instruments.emulated import World, devices
-    >>> bench = World()
-    >>> state = bench.add_camera("8-14", 93588)
-    >>> with Boson(devices.EmulatedBoson(bench, "8-14")) as port:
-    ...     port.fpa_temperature(), port.identity()["is_simulated"]  # K
-    (308.15, True)
     """
 
     def __init__(self, transport: Transport, *, first_sequence: int | None = None) -> None:
@@ -175,7 +165,7 @@ class Boson(Closing):
         first = moment if first_sequence is None else first_sequence
         self.is_simulated = transport.is_simulated
         self._transport, self._clock = transport, transport.clock
-        self._decoder = fslp.Decoder()
+        self._decoder = _fslp.Decoder()
         self._sequence = (first - 1) % (1 << 32)
         self._lock = threading.Lock()
 
@@ -283,8 +273,8 @@ class Boson(Closing):
         """Send a request, again under a new number if no reply comes; return the reply's data."""
         for _ in range(repeats + 1):
             with self._clock.hold(self._lock):
-                self._sequence = fslp.next_sequence(self._sequence)
-                self._transport.write(fslp.encode(self._sequence, command, data))
+                self._sequence = _fslp.next_sequence(self._sequence)
+                self._transport.write(_fslp.encode(self._sequence, command, data))
                 if reply := self._reply(name):
                     break
         else:
@@ -292,33 +282,27 @@ class Boson(Closing):
             raise BosonTimeoutError(f"No reply to '{name}' within {REPLY_TIMEOUT:g} s. {rule}.")
         # What the reply says.
         if reply.command != command:
-            raise BosonError(
-                f"Invalid reply to '{name}', of command 0x{reply.command:08X}. "
-                f"Must be of command 0x{command:08X}."
-            )
+            label = f"Invalid reply to '{name}', of command 0x{reply.command:08X}"
+            raise BosonError(f"{label}. Must be of command 0x{command:08X}.")
         if reply.status:
             meaning = STATUSES.get(reply.status, "unknown status")
-            raise BosonError(
-                f"Refused '{name}' by the camera: status 0x{reply.status:X}, {meaning}. "
-                "Must be 0, OK."
-            )
+            label = f"Refused '{name}' by the camera: status 0x{reply.status:X}, {meaning}"
+            raise BosonError(f"{label}. Must be 0, OK.")
         return reply.data
 
-    def _reply(self, name: str) -> fslp.Frame | None:
+    def _reply(self, name: str) -> _fslp.Frame | None:
         """Reply to the last request, None if it does not come in time; other frames are ignored."""
-        key = (fslp.COMMAND_CHANNEL, self._sequence)
+        key = (_fslp.COMMAND_CHANNEL, self._sequence)
         deadline, received = self._clock() + REPLY_TIMEOUT, 0
         while (remaining := deadline - self._clock()) > 0:
             if not (piece := self._transport.read(_READ_SIZE, remaining)):
                 break
             received += len(piece)
             if received > MAXIMUM_RECEIVED:
-                raise BosonError(
-                    f"No reply to '{name}' within {MAXIMUM_RECEIVED} bytes. "
-                    "Must be a Boson's command port that no other program uses."
-                )
+                rule = "Must be a Boson's command port that no other program uses"
+                raise BosonError(f"No reply to '{name}' within {MAXIMUM_RECEIVED} bytes. {rule}.")
             for frame in self._decoder.feed(piece):
-                if (frame.channel, frame.sequence) == key and frame.status != fslp.REQUEST:
+                if (frame.channel, frame.sequence) == key and frame.status != _fslp.REQUEST:
                     return frame
         return None
 

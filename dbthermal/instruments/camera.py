@@ -57,8 +57,8 @@ class FrameFlag(Flags):
 
 GOOD: Final = FrameFlag(0)  # no flag
 
+# Flags of a frame with wrong counts, and maybe wrong telemetry.
 DAMAGED: Final = FrameFlag.DRIVER_ERROR | FrameFlag.WRONG_SIZE
-"""Flags of a frame with wrong counts, and maybe wrong telemetry."""
 
 _WRONG_TIME = FrameFlag.SEQUENCE_STANDS | FrameFlag.TIME_STANDS | FrameFlag.TIME_WRONG
 UNTIMED: Final = DAMAGED | _WRONG_TIME | FrameFlag.PADDED

@@ -149,14 +149,9 @@ def open_devices(
     and `pictures` has by band the counts that an emulated camera sees in it, at a time of the scene
     [s]; by default, with the default world, its blackbody. The devices are closed in the end.
 
-    Raises
-    ------
-    ValueError
-        If an address or a camera is of another kind, or world or pictures are given for hardware.
-    KeyError
-        If the world has no such camera.
-    OSError, WheelError, TC08Error
-        If a device cannot be opened, or is another one.
+    ValueError if an address or a camera is of another kind, or world or pictures are given for
+    hardware; KeyError if the world has no such camera; OSError, WheelError or TC08Error if a device
+    cannot be opened, or is another one.
 
     Examples
     --------
@@ -202,10 +197,8 @@ def open_devices(
             if world is None:
                 logger = TC08.from_url(session.devices[LOGGER])
             else:
-                unit = _emulated(".devices").EmulatedTC08(
-                    world.thermocouple_temperature, world.clock
-                )
-                logger = TC08(unit).open()
+                tips = world.thermocouple_temperature, world.clock
+                logger = TC08(_emulated(".devices").EmulatedTC08(*tips)).open()
             stack.enter_context(logger).set_channels(session.thermocouples)
         yield Devices(session, sources, controls, wheel, logger, world)
 

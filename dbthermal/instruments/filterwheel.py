@@ -207,14 +207,11 @@ class FilterWheel(Closing):
         self._resting(homed=False)
         self._is_lost = True
         self._controller.begin(Id.MOT_MOVE_HOME, CHANNEL)
-
-        def is_home(status: apt.Status) -> bool:
-            return status.bits & (StatusBits.HOMED | StatusBits.HOMING) == StatusBits.HOMED
-
         # The counter may stand while a controller searches for the switch: no stall limit. The
         # homed bit alone may be that of an earlier search: the wheel must have moved.
-        name, limits = "Search for home", (HOME_TIMEOUT, HOME_TIMEOUT)
-        self._follow(name, Id.MOT_MOVE_HOMED, limits, is_home, must_move=True)
+        limits, mask = (HOME_TIMEOUT, HOME_TIMEOUT), StatusBits.HOMED | StatusBits.HOMING
+        action = "Search for home", Id.MOT_MOVE_HOMED, limits
+        self._follow(*action, lambda status: status.bits & mask == StatusBits.HOMED)
         self._is_lost = False
 
     def move_to(self, position: int) -> None:
@@ -231,13 +228,12 @@ class FilterWheel(Closing):
         # The move, until the wheel is there.
         data = apt.pack(apt.Position(CHANNEL, target))
         self._controller.begin(Id.MOT_MOVE_ABSOLUTE, data=data)
-
-        def has_arrived(status: apt.Status) -> bool:
-            return abs(scale.degrees(status.position - target)) <= TOLERANCE
-
         name, limits = f"Move to {scale.degrees(target):.2f} deg", (MOVE_TIMEOUT, STALL_TIMEOUT)
+        action = name, Id.MOT_MOVE_COMPLETED, limits
         try:
-            self._follow(name, Id.MOT_MOVE_COMPLETED, limits, has_arrived, must_move=False)
+            self._follow(
+                *action, lambda status: abs(scale.degrees(status.position - target)) <= TOLERANCE
+            )
         except StalledWheelError:
             self._is_lost = True
             raise
@@ -254,10 +250,8 @@ class FilterWheel(Closing):
         status = self._resting(homed=True)
         position = self._scale.position(status.position, self.settings.home_offset)
         if position is None:
-            raise WheelError(
-                f"The wheel is between two slots, {self._place(status)}. "
-                f"Must be within {TOLERANCE} deg of one: move it."
-            )
+            label = f"The wheel is between two slots, {self._place(status)}"
+            raise WheelError(f"{label}. Must be within {TOLERANCE} deg of one: move it.")
         return position
 
     def band(self) -> str:
@@ -318,27 +312,20 @@ class FilterWheel(Closing):
         if status.bits & MOVING:
             raise WheelError("The wheel is still moving. Must be at rest: wait, or stop it.")
         if homed and (self._is_lost or not status.bits & StatusBits.HOMED):
-            raise NotHomedError(
-                "The wheel was not homed since it was switched on, or has lost steps since. "
-                "Must be homed."
-            )
+            label = "The wheel was not homed since it was switched on, or has lost steps since"
+            raise NotHomedError(f"{label}. Must be homed.")
         return status
 
     def _place(self, status: apt.Status) -> str:
         return f"at {self._scale.degrees(status.position):.2f} deg"
 
     def _follow(
-        self,
-        name: str,
-        end: Id,
-        limits: tuple[float, float],
-        is_there: Callable[[apt.Status], bool],
-        *,
-        must_move: bool,
+        self, name: str, end: Id, limits: tuple[float, float], goal: Callable[[apt.Status], bool]
     ) -> None:
         """Poll until a motion is over; raise if it fails, with the wheel stopped if it moves.
 
-        `limits` are the longest motion, and the longest time at one place [s].
+        `limits` are the longest motion, and the longest time at one place [s]. At its end the state
+        is the goal; in a search for home the wheel must have moved.
         """
         start = changed = self._clock()
         moved, rests, confirmed, count = False, 0, 0, None
@@ -358,9 +345,9 @@ class FilterWheel(Closing):
                 count, changed = status.position, now
             rests = 0 if moving else rests + 1
             # Over, by its end and its place.
-            rested = rests > 0 and (moved or not must_move)
-            ended = rested or self._controller.has_reported(end)
-            confirmed = confirmed + 1 if ended and is_there(status) else 0
+            rested = rests > 0 and (moved or end is not Id.MOT_MOVE_HOMED)
+            ended = rested or end in self._controller.ended
+            confirmed = confirmed + 1 if ended and goal(status) else 0
             # Failed: at rest elsewhere, too long under way, or standing still.
             place = self._place(status)
             if confirmed:
@@ -370,10 +357,8 @@ class FilterWheel(Closing):
                 raise StalledWheelError(f"{name}: the wheel {action} {place}. Must arrive.")
             elif now - start > limits[0]:
                 self.stop()
-                raise WheelError(
-                    f"{name}: the wheel was still {place} after {limits[0]} s, and was "
-                    "stopped. Must arrive in this time."
-                )
+                label = f"{name}: the wheel was still {place} after {limits[0]} s, and was stopped"
+                raise WheelError(f"{label}. Must arrive in this time.")
             elif now - changed > limits[1]:
                 self.stop()
                 raise StalledWheelError(

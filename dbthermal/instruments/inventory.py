@@ -10,12 +10,11 @@ import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import usb.core
 
-if TYPE_CHECKING:
-    from dbthermal.instruments.session import Session
+from dbthermal.instruments.session import Session
 
 __all__ = ["KINDS", "Device", "Kind", "LibusbMissingError", "describe", "find", "plugged_in"]
 __dir__ = __all__.copy
@@ -186,7 +185,7 @@ def _bandwidth(device: Device, cameras: list[Device], frame_rate: float) -> Iter
         )
 
 
-def plugged_in(session: "Session") -> str:
+def plugged_in(session: Session) -> str:
     """Report of the USB bus for a session; of an emulated one the bus is not looked at."""
     if session.simulated:
         return f"Session '{session.name}' is emulated: the USB bus was not looked at."

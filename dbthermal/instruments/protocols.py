@@ -38,16 +38,12 @@ def ask_for_blackbody(name: str, temperature: float) -> None:
         Name of the session, for the question; temperature [K].
     """
     celsius = f"{temperature - zero_Celsius:.2f} degC"
-    question = (
-        f"\n{name}: set the blackbody to {celsius} and press Enter; then its rest is awaited. "
-    )
+    wish = f"set the blackbody to {celsius} and press Enter; then its rest is awaited. "
     try:
-        input(question)
+        input(f"\n{name}: {wish}")
     except (EOFError, NotImplementedError) as error:
-        raise RuntimeError(
-            f"Nobody at a keyboard sets the blackbody to {celsius}. Must be run in a terminal, or "
-            "in Jupyter."
-        ) from error
+        label = f"Nobody at a keyboard sets the blackbody to {celsius}"
+        raise RuntimeError(f"{label}. Must be run in a terminal, or in Jupyter.") from error
 
 
 def wait_stable(
@@ -102,32 +98,25 @@ def record_sweep(
     The cameras' offsets are corrected at each temperature, for they drift in the hours of a sweep.
     Complete recordings of this sweep that are in the folder are kept, so that an interrupted sweep
     goes on where it was. If the folder is renamed or moved meanwhile the sweep goes on in it. Call
-    `Devices.prepare` before.
+    `Devices.prepare` before. Returns the summaries in the order of the session, by temperature,
+    then filter, with those that were kept.
+
+    ValueError if the session has no blackbody, or no reading of it, or if a recording exists that
+    is incomplete, of another temperature, or during which the wheel turned. TimeoutError,
+    SourceLostError or FileNotFoundError as `wait_stable`, or if a camera is lost or the folder
+    deleted: what was recorded is kept.
 
     Parameters
     ----------
     devices : Devices
         Of a session with a blackbody, which the thermocouple of that name reads.
-    folder : str or Path
-        Where the recordings go: ``<name>_<step>_<band>.zarr``.
-    set_temperature : callable
-        Sets the blackbody [K], or asks the user to set it.
+    folder, set_temperature : str or Path, callable
+        Where the recordings go (``<name>_<step>_<band>.zarr``); sets the blackbody [K], or asks the
+        user to set it.
     limits, preview : optional
         As for `dbthermal.instruments.recording.record`. The camera behind the wheel has the name of
         the filter in the beam.
 
-    Returns
-    -------
-    list of Summary
-        In the order of the session, by temperature, then filter, with those that were kept.
-
-    Raises
-    ------
-    ValueError
-        If the session has no blackbody, or no reading of it; or a recording exists that is
-        incomplete, of another temperature, or during which the wheel turned.
-    TimeoutError, SourceLostError, FileNotFoundError
-        As `wait_stable`; or a camera is lost, or the folder deleted. What was recorded is kept.
     """
     session = devices.session
     readings = devices.readings()
@@ -175,10 +164,8 @@ def record_scene(
 
     Parameters
     ----------
-    devices : Devices
-        Of any session; call `Devices.prepare` before.
-    path : str or Path
-        Folder ``*.zarr`` to make.
+    devices, path : Devices, str or Path
+        Of any session (call `Devices.prepare` before); folder ``*.zarr`` to make.
     limits, preview : optional
         As for `dbthermal.instruments.recording.record`, whose result and errors are those of this.
 

@@ -151,10 +151,10 @@ class Session:
         Cameras by band, in the order of the recording; addresses of other devices by name.
     shape, telemetry_rows : tuple of int, int
         Rows and columns; rows of telemetry in a frame, 0 or 2.
-    filters, wheel, sweep : dict of int to str, filterwheel.Settings, tuple of str
-        Slot of the wheel to band; its settings; filters at each temperature, see `swept`.
-    thermocouples : dict of int to str
-        Channel to measured object.
+    filters, thermocouples : dict of int to str
+        Slot of the wheel to band; channel to measured object.
+    wheel, sweep : filterwheel.Settings, tuple of str
+        Settings of the wheel; filters at each temperature, see `swept`.
 
     Examples
     --------

@@ -20,7 +20,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Protocol, Self, TypeVar
 
 from dbthermal import _text as texts
@@ -112,12 +111,7 @@ class Task(threading.Thread):
     """A thread that waits on a clock; the event `ended` is set at the end of its work."""
 
     def __init__(
-        self,
-        clock: Clock,
-        name: str,
-        work: Callable[..., object],
-        *values: Any,
-        daemon: bool = True,
+        self, clock: Clock, name: str, work: Callable[..., Any], *values: Any, daemon: bool = True
     ) -> None:
         super().__init__(name=name, daemon=daemon)
         self.ended = threading.Event()
@@ -293,10 +287,7 @@ class Closing:
         return self
 
     def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: object
     ) -> None:
         try:
             self.close()

@@ -35,6 +35,12 @@ def bounds(
     polynomials of time; y, one number a frame, eliminated by variable projection [2]_, and in the
     frames at rest one number for all. Response and noise are known.
 
+    For the linear response and two bands, ``resting=False`` gives the reflection ratio its closed
+    form, and no emissivity: scaling :math:`1 - e_m` up and :math:`y - x` down
+    alike changes no sample. Frames at rest determine the emissivities, and sharpen the ratio; the
+    curvature of the exact response determines them without, but hardly, and the bound of the ratio
+    is then loose. An `emissivity_std` of 0.29, that of a uniform number in (0, 1), tightens it.
+
     TypeError or ValueError if an input is not as described, there is one band only, an emissivity
     lies outside (0, 1), a temperature outside the response's range, or no smooth subspace holds the
     object.
@@ -68,14 +74,6 @@ def bounds(
         bands, is below that of a uniform number in (0, 1) or in the calibrated range, and for a
         ratio below the ratio itself. `condition_number`, `order` (y, x) [1]; `resting`
         (time, y, x).
-
-    Notes
-    -----
-    For the linear response and two bands, ``resting=False`` gives the reflection ratio its closed
-    form, and no emissivity: scaling :math:`1 - e_m` up and :math:`y - x` down
-    alike changes no sample. Frames at rest determine the emissivities, and sharpen the ratio; the
-    curvature of the exact response determines them without, but hardly, and the bound of the ratio
-    is then loose. An `emissivity_std` of 0.29, that of a uniform number in (0, 1), tightens it.
 
     References
     ----------
@@ -155,19 +153,11 @@ def _truth(scene: xr.Dataset, *, resting: bool) -> Truth:
 
 def _identifiable(stds: dict[str, Array], emissivity: Array, reference: int, curve: Curve) -> Mask:
     """Quantities (quantity, pixel) that the capture determines better than their limits do."""
-    scales = {
-        "emissivity": np.full_like(emissivity, _UNIFORM),
-        "reflection_ratio": (1.0 - emissivity) / (1.0 - emissivity[reference]),
-    }
     limit = _UNIFORM * (curve.highest - curve.lowest)
-    return np.stack(
-        [
-            np.all(stds[name] < scales[name], axis=0)
-            if name in scales
-            else np.sqrt(np.mean(stds[name] ** 2, axis=0)) < limit
-            for name in QUANTITIES
-        ]
-    )
+    ratio = (1.0 - emissivity) / (1.0 - emissivity[reference])
+    below = [np.sqrt(np.mean(stds[name] ** 2, axis=0)) < limit for name in TEMPERATURES]
+    of_bands = stds["emissivity"] < _UNIFORM, stds["reflection_ratio"] < ratio
+    return np.stack([*below, *(np.all(band, axis=0) for band in of_bands)])
 
 
 def _dataset(scene: xr.Dataset, stds: dict[str, Array], maps: dict[str, Any]) -> xr.Dataset:

@@ -13,8 +13,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from dbthermal import _smooth as smooth
-from dbthermal import mixing
+from dbthermal import _smooth, mixing
 from dbthermal._arrays import Array, Mask
 from dbthermal.bands import Band
 from dbthermal.response import Curve
@@ -102,7 +101,7 @@ class Truth:
         """Truth with the object projected onto each pixel's smooth subspace."""
         smoothed = self.object_temperature.copy()
         for count in np.unique(order):
-            functions = smooth.polynomial_basis(self.time, int(count))
+            functions = _smooth.polynomial_basis(self.time, int(count))
             smoothed[:, order == count] = functions @ (functions.T @ smoothed[:, order == count])
         return replace(self, object_temperature=smoothed)
 
@@ -119,13 +118,12 @@ def smallest_order(truth: Truth, sensitivity: Sensitivity) -> Indices:
     :math:`z_2 - k_2 z_1`, which holds no background, over the variance of its noise.
     """
     highest = min(_HIGHEST_ORDER, truth.time.size)
-    functions = smooth.polynomial_basis(truth.time, highest)
+    functions = _smooth.polynomial_basis(truth.time, highest)
     order = np.full(truth.object_temperature.shape[1], highest + 1, dtype=np.intp)
     for pixels in _blocks(np.arange(order.size)):
         selected = sensitivity.select(pixels)
-        weight = np.einsum(
-            "itp,ijtp,jtp->tp", selected.emission, selected.projection(), selected.emission
-        )
+        p, projection = selected.emission, selected.projection()
+        weight = np.einsum("itp,ijtp,jtp->tp", p, projection, p)
         residual = truth.object_temperature[:, pixels]
         for count, function in enumerate(functions.T, start=1):
             residual = residual - np.outer(function, function @ residual)
@@ -162,7 +160,7 @@ def deviations(
     rows = {name: frames if "temperature" in name else bands for name in QUANTITIES}
     result = {name: np.zeros((size, pixels)) for name, size in rows.items()}
     for count in np.unique(order):
-        functions = smooth.polynomial_basis(time, int(count))
+        functions = _smooth.polynomial_basis(time, int(count))
         for block in _blocks(np.flatnonzero(order == count)):
             stds = _deviations(sensitivity.select(block), functions, reference, prior)
             for name, values in stds.items():

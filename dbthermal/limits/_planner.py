@@ -35,16 +35,12 @@ class CaptureDesign:
 
     Attributes
     ----------
-    seconds : float
-        Length [s].
-    rate : float
-        Frame rate [1/s].
+    seconds, rate : float
+        Length [s], and frame rate [1/s].
     start, span : float
         First temperature of the object, and its rise until the last frame [K].
-    level : float
-        Temperature of the background at rest [K].
-    amplitude : float
-        Height of a pulse [K].
+    level, amplitude : float
+        Temperature of the background at rest, and height of a pulse [K].
     period, duration : float
         From pulse to pulse, and of one pulse [s].
     """
@@ -92,21 +88,18 @@ def plan(
 
     Parameters
     ----------
-    table : Dataset
-        Stage `emissivity_table`, of bands of `bands.FILTERS`: the camera's own and filters.
-    noise : DataArray
-        Noise (band) [K] of every band of the table, such as from `emissivity.filter_noise`.
+    table, noise : Dataset, DataArray
+        Stage `emissivity_table`, of bands of `bands.FILTERS`: the camera's own and filters; noise
+        (band) [K] of every band of it, such as from `emissivity.filter_noise`.
     design : CaptureDesign, optional
         Capture conditions; 35 s of an object that warms by 25 K if not given, outdoors below a sky
         of 273 K.
-    beside : str, optional
-        Name of the band that is always recorded; "8-14", outdoors "10.6" as in the air's window.
-    together : int
-        Number of filters recorded beside it at once.
-    temperature : float
-        Temperature [K] at which the noise is stated; in counts it is the same at all.
-    outdoors : bool
-        The sky is mirrored, whose changes in the bands are not alike (`SKY`).
+    beside, together : str, int, optional
+        Name of the band that is always recorded ("8-14", outdoors "10.6" as in the air's window),
+        and number of filters recorded beside it at once.
+    temperature, outdoors : float, bool
+        Temperature [K] at which the noise is stated (in counts it is the same at all); True if the
+        sky is mirrored, whose changes in the bands are not alike (`SKY`).
 
     Returns
     -------
@@ -183,19 +176,14 @@ def plan_durations(
 ) -> xr.Dataset:
     """Expected accuracy of captures of several lengths, of one filter at a time.
 
+    As from `plan`, with `seconds` [s] as the first dimension; `noise` is the same in all.
+
     Parameters
     ----------
     table, noise
         See `plan`.
-    seconds : sequence of float
-        Lengths [s], which must increase; the object's rise and the pulses are the same in all.
-    design : CaptureDesign, optional
-        All conditions but the length.
-
-    Returns
-    -------
-    Dataset
-        That of `plan` with `seconds` [s] as the first dimension; `noise` is the same in all.
+    seconds, design : sequence of float, CaptureDesign
+        Lengths [s], which must increase; all other conditions, the same for all lengths.
 
     Examples
     --------
@@ -228,13 +216,10 @@ def _truth(design: CaptureDesign, emissivity: Array) -> Truth:
     phase = np.mod(time + 0.5 / design.rate, design.period)
     pulse = phase > design.period - design.duration
     materials = np.ones(emissivity.shape[1])
-    return Truth(
-        time=time,
-        object_temperature=np.outer(design.start + design.span * rise, materials),
-        background_temperature=np.outer(design.level + design.amplitude * pulse, materials),
-        emissivity=emissivity,
-        resting=np.outer(~pulse, materials.astype(bool)),
-    )
+    temperature = np.outer(design.start + design.span * rise, materials)
+    background = np.outer(design.level + design.amplitude * pulse, materials)
+    resting = np.outer(~pulse, materials.astype(bool))
+    return Truth(time, temperature, background, emissivity, resting)
 
 
 def _sky(emissivity: Array, noise: Array, names: list[str]) -> Array:

@@ -10,9 +10,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import schema
-from dbthermal.readers import _containers as containers
-from dbthermal.readers import _formats as formats
-from dbthermal.readers import _recording as recordings
+from dbthermal.readers import _containers, _formats, _recording
 from dbthermal.readers._recording import MEMORY, Clock
 
 # Names of dims by their place, and those of an array without names, of any case.
@@ -73,9 +71,9 @@ def array(
     # Unit and memory, before a file is opened.
     is_file = isinstance(source, str | Path)
     label = Path(source).name if isinstance(source, str | Path) else "array"
-    recordings.check_unit(unit, label)
-    recordings.check_number(memory, "memory")
-    (path,) = formats.files([source], "array") if isinstance(source, str | Path) else (Path(),)
+    _recording.check_unit(unit, label)
+    _recording.check_number(memory, "memory")
+    (path,) = _formats.files([source], "array") if isinstance(source, str | Path) else (Path(),)
     inside = path.rglob("*") if path.is_dir() else [path]
     stored = sum(file.lstat().st_size for file in inside) if is_file else np.inf
     with ExitStack() as stack:
@@ -84,38 +82,38 @@ def array(
         if not (is_file or isinstance(getattr(source, "dtype", None), np.dtype)):
             values = np.asarray(source)  # of a list, or of another library
         if is_file:
-            values, lines = containers.opened(path, name, stack)
+            values, lines = _containers.opened(path, name, stack)
         else:
             coords = source.coords.values() if isinstance(source, xr.DataArray) else ()
-            lines = [axis for axis in coords if containers.are_times(axis.name, axis)][:1]
+            lines = [axis for axis in coords if _containers.are_times(axis.name, axis)][:1]
         attributes = _checked(values, label, unit)
-        recordings.check_memory(getattr(values, "shape", ()), memory, label, stored)
+        _recording.check_memory(getattr(values, "shape", ()), memory, label, stored)
         for times in lines:
             seconds = _seconds(times, values.shape[0], clock, label, path)
             clock = seconds if clock is None else clock
         if clock is None:
-            recordings.stamps(clock, 0, label)  # refuses it
-        read = containers.read(values, path) if is_file else recordings.film(values)
+            _recording.stamps(clock, 0, label)  # refuses it
+        read = _containers.read(values, path) if is_file else _recording.film(values)
     counts = read.view(np.uint16)
     # The numbers: byte order, and values that stand for missing counts.
     judged = is_file and any(np.any(frame & 0xFF) for frame in counts)
-    if judged and recordings.smoother(counts) < 0:  # as after a flipped bit of the header
+    if judged and _recording.smoother(counts) < 0:  # as after a flipped bit of the header
         rule = "rougher than with bytes swapped. Must be in the byte order that is stated"
         raise ValueError(f"Invalid counts of '{label}': {rule}.")
     fills = [attributes[name] for name in ("_FillValue", "missing_value") if name in attributes]
     fills = [float(fill) % 2**16 for fill in fills] if read.dtype.kind == "i" else fills
-    recordings.check_present(counts, fills, label)
+    _recording.check_present(counts, fills, label)
     assert clock is not None
-    return recordings.clocked(counts, clock, label, format="array", **schema.origin(attributes))
+    return _recording.clocked(counts, clock, label, format="array", **schema.origin(attributes))
 
 
 def _checked(values: Any, label: str, unit: str) -> dict[str, Any]:
     """Attributes of an array, not yet read, whose dims, scale, type and unit are of counts."""
-    for dim, names in zip(containers.dims_of(values), _DIMS, strict=False):
+    for dim, names in zip(_containers.dims_of(values), _DIMS, strict=False):
         if not re.fullmatch(f"{names}{_WITHOUT_NAME}", str(dim), re.IGNORECASE):
             rule = "Must be (time, y, x): rename or transpose"
-            raise ValueError(f"Invalid dims {containers.dims_of(values)} of '{label}'. {rule}.")
-    texts = {name: containers.attribute(values, name) for name in _ATTRIBUTES}
+            raise ValueError(f"Invalid dims {_containers.dims_of(values)} of '{label}'. {rule}.")
+    texts = {name: _containers.attribute(values, name) for name in _ATTRIBUTES}
     attributes = {name: text for name, text in texts.items() if text is not None}
     for scale, neutral in {"scale_factor": 1.0, "add_offset": 0.0}.items():
         if attributes.get(scale, neutral) != neutral:
@@ -127,7 +125,7 @@ def _checked(values: Any, label: str, unit: str) -> dict[str, Any]:
         rule = "Must be uint16: counts, neither temperatures nor objects; convert whole numbers"
         raise ValueError(f"Invalid dtype {dtype} of '{label}'. {rule}.")
     text = str(attributes.get("units", attributes.get("unit", unit))).strip()
-    recordings.check_unit(unit if text in {"", "1"} else text, label)
+    _recording.check_unit(unit if text in {"", "1"} else text, label)
     return attributes
 
 
@@ -136,8 +134,8 @@ def _seconds(times: Any, frames: int, clock: Clock | None, label: str, path: Pat
     if times.size != frames:
         rule = f"Must be {frames}, one for each frame"
         raise ValueError(f"Invalid number {times.size} of times of '{label}'. {rule}.")
-    containers.check_whole(times, path)
-    if (moments := containers.moments(times)) is None:
+    _containers.check_whole(times, path)
+    if (moments := _containers.moments(times)) is None:
         return clock
-    unit = "s" if times.dtype.kind in "OSU" else containers.attribute(times, "units")
-    return recordings.check_times(moments, str(unit or ""), clock, label)
+    unit = "s" if times.dtype.kind in "OSU" else _containers.attribute(times, "units")
+    return _recording.check_times(moments, str(unit or ""), clock, label)

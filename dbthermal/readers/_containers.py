@@ -21,9 +21,7 @@ import numpy.typing as npt
 import zarr
 
 from dbthermal import _text as texts
-from dbthermal.readers import _formats as formats
-from dbthermal.readers import _recording as recordings
-from dbthermal.readers import _variables as variables
+from dbthermal.readers import _formats, _recording, _variables
 
 # Names of times: of a dim, and of an array beside another.
 _BESIDE: Final = re.compile("(frame_?)?time(s|_?stamps?|_s)?", re.IGNORECASE)
@@ -107,27 +105,27 @@ def opened(path: Path, name: str | None, stack: ExitStack) -> tuple[Any, list[An
 
     What the libraries raise until the file is closed names it as damaged.
     """
-    kind = formats.format_of(path)
+    kind = _formats.format_of(path)
     if not kind:
         rule = "Must be .npy, .npz, HDF5, NetCDF, MATLAB or zarr"
         raise ValueError(f"Invalid '{path.name}': of no format, by its first bytes. {rule}.")
-    stack.enter_context(recordings.damage_named(f"Damaged '{path.name}'", f"a whole {kind}"))
+    stack.enter_context(_recording.damage_named(f"Damaged '{path.name}'", f"a whole {kind}"))
     stack.enter_context(warnings.catch_warnings(action="error", category=RuntimeWarning))
     warnings.simplefilter("error", UserWarning)  # as of one dimension twice
     arrays = _OPENED[kind](path, stack)
     shapes = [f"{key} {tuple(array.shape)}" for key, array in arrays.items()]
     arrays = {n: array for n, array in arrays.items() if array.ndim == 3 or are_times(n, array)}
     films = [key for key in arrays if arrays[key].ndim == 3]
-    name = recordings.array_name(films, name, path, shapes)
+    name = _recording.array_name(films, name, path, shapes)
     return arrays[name], _times_of(arrays, name, arrays[name].shape[0])
 
 
 def read(values: Any, path: Path) -> npt.NDArray[Any]:
     """Numbers of an array of a file, once it is checked to be whole."""
-    if isinstance(values, variables.Stream):
+    if isinstance(values, _variables.Stream):
         return values.counts()
     check_whole(values, path)
-    counts = recordings.film(values)
+    counts = _recording.film(values)
     if path.is_dir():
         return counts
     with path.open("rb") as stream:
@@ -136,7 +134,7 @@ def read(values: Any, path: Path) -> npt.NDArray[Any]:
 
 
 def _hdf5(path: Path, stack: ExitStack) -> dict[str, Any]:
-    h5py = recordings.optional("h5py", "recordings")
+    h5py = _recording.optional("h5py", "recordings")
     file = stack.enter_context(h5py.File(path, "r"))
     arrays, headers = dict[str, Any](), [8]
 
@@ -161,7 +159,7 @@ def _hdf5(path: Path, stack: ExitStack) -> dict[str, Any]:
 
 def _filters(array: Any, path: Path) -> list[int]:
     """Codes of the filters of an array of HDF5, of which one packs, behind those that shuffle."""
-    h5py, form = recordings.optional("h5py", "recordings"), array.id.get_create_plist()
+    h5py, form = _recording.optional("h5py", "recordings"), array.id.get_create_plist()
     filters = [form.get_filter(n) for n in range(form.get_nfilters())]
     codes = [code for code, *_ in filters]
     packers = [code for code in codes if code not in {_SHUFFLE, _SUM}]
@@ -201,13 +199,13 @@ def _check_pieces(array: Any, path: Path) -> None:
     width = _VLEN if array.dtype.kind == "O" else array.dtype.itemsize
     size = math.prod(array.chunks) * width
     wanted = math.prod(-(-n // piece) for n, piece in zip(array.shape, array.chunks, strict=True))
-    recordings.check_pieces(wanted, array.nbytes, f"chunks of '{name}'")
+    _recording.check_pieces(wanted, array.nbytes, f"chunks of '{name}'")
     chunks = list[tuple[tuple[int, ...], int, int]]()
     array.id.chunk_iter(lambda c: chunks.append((c.chunk_offset, c.filter_mask, c.size)))
     packer = next((n for n, code in enumerate(codes) if code in _PACKERS), len(codes))
     if len(chunks) != wanted or not {mask for _, mask, _ in chunks} <= {0, 1 << packer}:
         raise ValueError(f"Missing chunks or filters of '{name}'. Must be {wanted}, all alike.")
-    if size > max(recordings.SMALL, array.nbytes):
+    if size > max(_recording.SMALL, array.nbytes):
         raise ValueError(f"Invalid chunk of {size} bytes of '{name}'. Must be its size at most.")
     # Contents of their size, for HDF5 takes any: one that packing does not shorten is as it is.
     before, after = (4 * part.count(_SUM) for part in (codes[:packer], codes[packer:]))
@@ -238,7 +236,7 @@ def _foreign_store(path: Path, _: ExitStack) -> dict[str, Any]:
             if not re.fullmatch(_LOSSLESS, kind, re.IGNORECASE):
                 rule = "Must be one that changes no counts: save them without it"
                 raise ValueError(f"Invalid filter '{kind}' of '{name}' of '{path.name}'. {rule}.")
-        recordings.check_pieces(array.nchunks, array.nbytes, f"chunks of '{name}'")
+        _recording.check_pieces(array.nchunks, array.nbytes, f"chunks of '{name}'")
         if (kind := type(array.serializer).__name__) not in {"BytesCodec", "NoneType"}:
             raise ValueError(f"Invalid serializer '{kind}' of '{name}'. Must be bytes alone.")
         missing = 0 if array.shards else array.nchunks - array.nchunks_initialized
@@ -285,7 +283,7 @@ def _check_unpacked(values: zarr.Array[Any], keys: list[Path], path: Path) -> No
     # A filter that checks adds its sum to a chunk before it is packed.
     sums = [getattr(code, "codec_id", "") in _CHECKSUMS for code in values.filters]
     size = values.dtype.itemsize * math.prod(values.chunks) + 4 * sum(sums)
-    if math.prod(pieces) * values.dtype.itemsize > max(recordings.SMALL, values.nbytes):
+    if math.prod(pieces) * values.dtype.itemsize > max(_recording.SMALL, values.nbytes):
         raise ValueError(f"Invalid chunk {pieces} of '{path.name}'. Must be its size at most.")
     codecs = [getattr(codec, "codec_id", type(codec).__name__) for codec in values.compressors]
     kinds = [kind.lower().removesuffix("codec") for kind in codecs]
@@ -344,11 +342,11 @@ _UNPACKED: Final[dict[str, Callable[[bytes, int], bool]]] = {
 _OPENED: Final[dict[str, Callable[[Path, ExitStack], dict[str, Any]]]] = {
     "zarr": _foreign_store,
     "HDF5": _hdf5,
-    "NetCDF": lambda path, _: variables.netcdf_arrays(path),
-    "MATLAB 5": lambda path, _: variables.matlab_arrays(path),
+    "NetCDF": lambda path, _: _variables.netcdf_arrays(path),
+    "MATLAB 5": lambda path, _: _variables.matlab_arrays(path),
     "NumPy": lambda path, stack: (
-        {path.stem: variables.numpy_array(path, stack.enter_context(path.open("rb")))}
+        {path.stem: _variables.numpy_array(path, stack.enter_context(path.open("rb")))}
     ),
-    "zip": variables.numpy_arrays,
+    "zip": _variables.numpy_arrays,
 }
 """Format -> function that opens its arrays by name."""

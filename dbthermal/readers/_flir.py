@@ -16,9 +16,7 @@ import xarray as xr
 from dbthermal import _text as texts
 from dbthermal._arrays import Array, Mask, empty, release
 from dbthermal._warnings import warned
-from dbthermal.readers import _flir_records as container
-from dbthermal.readers import _formats as formats
-from dbthermal.readers import _recording as recordings
+from dbthermal.readers import _flir_records, _formats, _recording
 from dbthermal.readers._flir_records import Content, Frame
 from dbthermal.readers._formats import Paths
 from dbthermal.readers._recording import MEMORY, Clock, Counts, FileFlag
@@ -97,10 +95,9 @@ def flir(
         Frames to read, not negative; of a long or damaged recording only those are looked at.
     clock : float or array_like, optional
         Frame rate [Hz] or time of each frame [s], in place of the file's times.
-    byte_order : {"little", "big"}, optional
-        Order of an image's bytes, in place of what is decided.
-    memory : float
-        Largest memory that the counts may take [byte]; refused before it is taken.
+    byte_order, memory : {"little", "big"} or None, float
+        Order of an image's bytes, in place of what is decided; largest memory that the counts may
+        take [byte], refused before it is taken.
 
     Returns
     -------
@@ -128,11 +125,11 @@ def flir(
     Traceback (most recent call last):
     ValueError: Refused 'recording.ravi': export its counts as 16-bit TIFF with the maker's program and use readers.tiff.
     """  # noqa: E501
-    paths = formats.files(path, "flir")
-    name = recordings.label(paths)
-    recordings.check_number(memory, "memory")
+    paths = _formats.files(path, "flir")
+    name = _recording.label(paths)
+    _recording.check_number(memory, "memory")
     wanted = slice(None) if frames is None else frames
-    stated = "" if byte_order is None else recordings.byte_order(name, byte_order)
+    stated = "" if byte_order is None else _recording.byte_order(name, byte_order)
     # Records of the selected frames.
     with ExitStack() as stack:
         try:
@@ -145,7 +142,7 @@ def flir(
         # Images, all of the form of the first.
         form = _image(*listed[0], stated)._replace(body=b"")
         stored = sum(file.stat().st_size for file in paths)
-        recordings.check_memory((len(listed), *form.shape), memory, name, stored)
+        _recording.check_memory((len(listed), *form.shape), memory, name, stored)
         counts = empty((len(listed), *form.shape), np.uint16)
         for number, listing in enumerate(listed):
             image, place = _image(*listing, stated), listing[-1]
@@ -156,12 +153,12 @@ def flir(
                 values = np.frombuffer(image.body, f"{image.order}u2")
                 counts[number] = values.reshape(image.shape)
             elif image.codec == "png":
-                counts[number] = recordings.png(image.body, place)
+                counts[number] = _recording.png(image.body, place)
             else:
-                codecs = recordings.optional("imagecodecs", "recordings")
-                with recordings.damage_named(f"Damaged image in {place}", "JPEG-LS that decodes"):
+                codecs = _recording.optional("imagecodecs", "recordings")
+                with _recording.damage_named(f"Damaged image in {place}", "JPEG-LS that decodes"):
                     values = codecs.jpegls_decode(image.body)
-                counts[number] = recordings.decoded(values, image.shape, place)
+                counts[number] = _recording.decoded(values, image.shape, place)
             release()
         seconds, same_number, attrs = _cameras(listed, timed=clock is None)
     # Byte order, flags and times.
@@ -169,11 +166,11 @@ def flir(
     flags = np.where(same_number, 0, FileFlag.NUMBERS_DIFFER.value).astype(np.uint16)
     seconds = np.where(same_number, seconds, np.nan)
     if clock is not None:
-        seconds = recordings.stamps(clock, len(counts), name)
+        seconds = _recording.stamps(clock, len(counts), name)
     about = {"source": name, "format": f"FLIR, {form.codec}", "byte_order": order}
     about |= {"byte_order_by": by, **attrs}
     doubts = [note for note in attrs["implausible"].split("; ") if note.startswith("checksum")]
-    made = recordings.recording(counts, seconds, name, about, flags)
+    made = _recording.recording(counts, seconds, name, about, flags)
     return warned(made, *(f"Wrong {note}: has it been edited?" for note in doubts[:1]))
 
 
@@ -188,10 +185,10 @@ def _walk(paths: Sequence[Path], memory: float, stack: ExitStack) -> Iterator[_F
         )
         if still := content[:2] == b"\xff\xd8":
             texts.regular_file(path, int(memory))
-            content = container.of_jpeg(content, path.name)
+            content = _flir_records.of_jpeg(content, path.name)
         number = 0
         try:
-            for records in container.frames(content, path.name, still=still):
+            for records in _flir_records.frames(content, path.name, still=still):
                 yield content, records, f"frame {number} of '{path.name}'"
                 number += 1
         except ValueError as error:
@@ -201,7 +198,7 @@ def _walk(paths: Sequence[Path], memory: float, stack: ExitStack) -> Iterator[_F
 
 def _image(content: Content, records: Frame, place: str, stated: str) -> _Image:
     """Form and bytes of an image, of a stated byte order, whose sizes agree wherever they are."""
-    body, fault = container.body(content, records[container.IMAGE])
+    body, fault = _flir_records.body(content, records[_flir_records.IMAGE])
     if fault:
         raise ValueError(f"Damaged image in {place}: {fault}.")
     head, body = body[:_IMAGE_SIZE], body[_IMAGE_SIZE:]
@@ -212,9 +209,9 @@ def _image(content: Content, records: Frame, place: str, stated: str) -> _Image:
     width, height = struct.unpack_from(f"{order}HH", head, 2)
     image = _Image((height, width), stated or order, "none", body)
     size = (height, width, 16)
-    if body[:8] == formats.PNG:
+    if body[:8] == _formats.PNG:
         image = image._replace(order="", codec="png")
-        size = recordings.png_size(body, place)
+        size = _recording.png_size(body, place)
     elif body[:2] == b"\xff\xd8":
         image = image._replace(order="", codec="jpegls")
         size = _jpegls_size(body, place)
@@ -231,7 +228,7 @@ def _jpegls_size(body: bytes, place: str) -> tuple[int, int, int]:
     """Height, width and bits that a JPEG-LS image states, which must be whole."""
     if not body.rstrip(b"\0").endswith(b"\xff\xd9"):
         raise ValueError(f"Truncated image in {place}: no end of JPEG. Must be whole.")
-    for marker, start, _ in container.segments(body, place):
+    for marker, start, _ in _flir_records.segments(body, place):
         if marker == 0xF7:
             bits, height, width, _ = struct.unpack_from(">BHHB", body, start)
             return height, width, bits
@@ -242,9 +239,9 @@ def _order(counts: Counts, form: _Image, stated: str | None, name: str) -> tuple
     """Byte order of the counts, which are swapped in place if need be, and what decided it."""
     if form.codec == "jpegls":
         return "none: numbers are coded", "codec"
-    order = recordings.ORDERS[form.order or ">"]  # a PNG has its highest byte first
+    order = _recording.ORDERS[form.order or ">"]  # a PNG has its highest byte first
     decided = "caller" if stated else "header" if form.order else "smoothness"
-    sign = recordings.smoother(counts)
+    sign = _recording.smoother(counts)
     if order != (stated or order) or (decided == "smoothness" and sign < 0):
         counts.byteswap(inplace=True)
         order, sign = "little" if order == "big" else "big", -sign
@@ -267,10 +264,10 @@ def _cameras(listed: Sequence[_Found], *, timed: bool) -> tuple[Array, Mask, dic
     milliseconds, first = np.full(len(listed), np.nan), dict[str, Any]()
     numbers, doubts = np.zeros((len(listed), 3), dtype=np.int64), dict[int, str]()
     for number, (content, records, place) in enumerate(listed):
-        if container.CAMERA not in records:
+        if _flir_records.CAMERA not in records:
             continue
         # The record, in its byte order.
-        body, fault = container.body(content, records[container.CAMERA])
+        body, fault = _flir_records.body(content, records[_flir_records.CAMERA])
         if fault:
             doubts[number] = f"checksum of the camera's record in {place}, {fault}"
         if len(body) < _CAMERA_SIZE or body[:2] not in {b"\2\0", b"\0\2"}:
@@ -281,7 +278,7 @@ def _cameras(listed: Sequence[_Found], *, timed: bool) -> tuple[Array, Mask, dic
             raise ValueError(f"Damaged {label}. {rule}.")
         order = "<" if body[0] else ">"
         # Numbers and time of the frame.
-        start = records[container.IMAGE].start
+        start = records[_flir_records.IMAGE].start
         image = "<" if content[start] else ">"
         (of_image,) = struct.unpack_from(f"{image}H", content, start + _NUMBER)
         (of_camera,) = struct.unpack_from(f"{order}H", body, _NUMBER)

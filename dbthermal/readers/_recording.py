@@ -17,14 +17,13 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from dbthermal import _text as texts
-from dbthermal import schema
+from dbthermal import _text, schema
 from dbthermal._arrays import Array, empty, made_on_disk, parts
 from dbthermal._warnings import warned
 from dbthermal.readers._formats import PNG
 
 Counts = npt.NDArray[np.uint16]
-
+Flags = npt.NDArray[np.uint16]
 Clock = float | npt.ArrayLike
 
 MEMORY: Final = 2.0**30  # largest memory that a recording may take, by default [byte]
@@ -124,7 +123,7 @@ def check_number(value: Any, name: str, *, whole: bool = False) -> None:
     rule = f"Must be a {'whole' if whole else 'finite'} number"
     array = np.asarray(value)
     if array.ndim or array.dtype.kind not in ("iu" if whole else "iuf"):
-        raise TypeError(f"Invalid {name} {texts.shown(value)}. {rule}.")
+        raise TypeError(f"Invalid {name} {_text.shown(value)}. {rule}.")
     if not np.isfinite(array):
         raise ValueError(f"Invalid {name} {value}. {rule}.")
 
@@ -270,11 +269,7 @@ def stamps(clock: Clock | None, frames: int, name: str) -> Array:
 
 
 def recording(
-    counts: Counts,
-    seconds: Array,
-    name: str,
-    attrs: Mapping[str, Any],
-    flags: npt.NDArray[np.uint16] | None = None,
+    counts: Counts, seconds: Array, name: str, attrs: Mapping[str, Any], flags: Flags | None = None
 ) -> xr.Dataset:
     """Dataset of one band: `counts` (time, y, x), its clock and flags; see `readers.flir`."""
     if _of_8_bits(counts):
@@ -400,4 +395,4 @@ def optional(module: str, extra: str) -> Any:
     try:
         return import_module(module)
     except ImportError as error:
-        raise ImportError(texts.missing_library(module, extra)) from error
+        raise ImportError(_text.missing_library(module, extra)) from error

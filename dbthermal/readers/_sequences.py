@@ -9,8 +9,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal._arrays import Array
-from dbthermal.readers import _formats as formats
-from dbthermal.readers import _recording as recordings
+from dbthermal.readers import _formats, _recording
 from dbthermal.readers._recording import MEMORY, Clock, Counts
 
 _FIRST: Final = 8  # frames that tell rows from columns
@@ -46,10 +45,8 @@ def raw(
 
     Parameters
     ----------
-    path : str or Path
-        Regular file.
-    shape : (int, int)
-        Rows and columns of a frame [pixel].
+    path, shape : str or Path, (int, int)
+        Regular file; rows and columns of a frame [pixel].
     byte_order : {"little", "big"}
         Order of the bytes of a number.
     unit, clock, memory
@@ -68,13 +65,13 @@ def raw(
     >>> bool((capture.counts == frames).all())
     True
     """
-    (file,) = formats.files([path], "raw")
+    (file,) = _formats.files([path], "raw")
     name = file.name
-    recordings.check_unit(unit, name)
+    _recording.check_unit(unit, name)
     # Form, as stated.
-    order = recordings.byte_order(name, byte_order)
+    order = _recording.byte_order(name, byte_order)
     for label, value in {"header": header, "frame_header": frame_header}.items():
-        recordings.check_number(value, f"{label} of '{name}'", whole=True)
+        _recording.check_number(value, f"{label} of '{name}'", whole=True)
         if value < 0:
             raise ValueError(f"Invalid {label} {value} of '{name}'. Must be 0 or more.")
     sizes = np.asarray(shape)
@@ -84,19 +81,19 @@ def raw(
         raise ValueError(f"Invalid shape {shape} of '{name}'. {rule}.")
     # Counts, whose images must be smooth in that form.
     form = np.dtype([("header", f"V{frame_header}"), ("counts", f"{order}u2", shape)])
-    counts = recordings.film(_frames(file, form, header, memory)["counts"])
-    if (sign := recordings.smoother(counts)) < 0:
+    counts = _recording.film(_frames(file, form, header, memory)["counts"])
+    if (sign := _recording.smoother(counts)) < 0:
         rule = "Must be the other byte order, or another shape or header"
         raise ValueError(f"Invalid counts of '{name}': rougher than with bytes swapped. {rule}.")
     if _are_longer(counts) or (sign == 0 and np.ptp(counts[0])):
         rule = "16-bit counts, smoother than with bytes swapped, not of 8 or 32 bits or packed"
         label = f"Invalid counts of '{name}': no images of 16-bit numbers"
         raise ValueError(f"{label}. Must be {rule}.")
-    if recordings.smoother(counts[:_FIRST], lambda frame: frame.reshape(shape[::-1])) < 0:
+    if _recording.smoother(counts[:_FIRST], lambda frame: frame.reshape(shape[::-1])) < 0:
         rule = "Must be rows, then columns"
         raise ValueError(f"Invalid shape {shape} of '{name}': rougher than {shape[::-1]}. {rule}.")
     decided = {"byte_order": byte_order, "byte_order_by": "caller"}
-    return recordings.clocked(counts, clock, name, format="raw", **decided)
+    return _recording.clocked(counts, clock, name, format="raw", **decided)
 
 
 def _are_longer(counts: Counts) -> bool:
@@ -113,7 +110,9 @@ def _are_longer(counts: Counts) -> bool:
 
 
 def sequence(path: str | Path, *, clock: Clock | None = None, memory: float = MEMORY) -> xr.Dataset:
-    """Counts of a recording in an .sfmov of FLIR or an .hcc of Telops.
+    """Counts of a recording in an .sfmov of FLIR or an .hcc of Telops, as from `tiff`.
+
+    FileNotFoundError or ValueError as `array`, and if the numbers are temperatures or radiances.
 
     Parameters
     ----------
@@ -121,28 +120,18 @@ def sequence(path: str | Path, *, clock: Clock | None = None, memory: float = ME
         File; the .inc of an .sfmov lies beside it.
     clock, memory
         As for `array`.
-
-    Returns
-    -------
-    Dataset
-        As from `tiff`.
-
-    Raises
-    ------
-    FileNotFoundError, ValueError
-        As `array`, and if the numbers are temperatures or radiances.
     """
-    recordings.check_number(memory, "memory")
-    (path,) = formats.files([path], "sequence")
-    with recordings.damage_named(f"Damaged '{path.name}'", "a whole .sfmov or .hcc"):
+    _recording.check_number(memory, "memory")
+    (path,) = _formats.files([path], "sequence")
+    with _recording.damage_named(f"Damaged '{path.name}'", "a whole .sfmov or .hcc"):
         read = _sfmov if path.suffix.lower() == ".sfmov" else _hcc
         counts, times = read(path, memory)
-    if recordings.smoother(counts) < 0:
+    if _recording.smoother(counts) < 0:
         raise ValueError(f"Invalid counts of '{path.name}', bytes swapped. Must be little-endian.")
     if times is not None:
-        clock = recordings.check_times(times, "s", clock, path.name)
+        clock = _recording.check_times(times, "s", clock, path.name)
     kind: Any = {"clock": clock, "format": path.suffix.lower()[1:]}
-    return recordings.clocked(counts, name=path.name, **kind)
+    return _recording.clocked(counts, name=path.name, **kind)
 
 
 def _frames(path: Path, form: np.dtype[Any], start: int, memory: float) -> npt.NDArray[Any]:
@@ -153,7 +142,7 @@ def _frames(path: Path, form: np.dtype[Any], start: int, memory: float) -> npt.N
         label = f"{size} bytes of '{path.name}': {number} frames and {remainder} bytes"
         rule = f"Must be whole frames of {form.itemsize} bytes behind {start}, as stated"
         raise ValueError(f"Truncated or damaged: {label}. {rule}.")
-    recordings.check_memory((number, *form["counts"].shape), memory, path.name, size)
+    _recording.check_memory((number, *form["counts"].shape), memory, path.name, size)
     return np.memmap(path, form, "r", start)
 
 
@@ -172,7 +161,7 @@ def _sfmov(path: Path, memory: float) -> tuple[Counts, Array | None]:
         raise ValueError(f"Invalid DaType '{kind}' of '{path.name}'. {rule}.")
     frames, rows, columns = (int(lines[name]) for name in names)
     size, behind = path.stat().st_size, len(header) + len(mark)
-    recordings.check_memory((frames, rows, columns), memory, path.name, size)
+    _recording.check_memory((frames, rows, columns), memory, path.name, size)
     # The frames end with the file; blanks, if any, and the end of the line lie before them.
     start = size - 2 * frames * rows * columns
     if not re.fullmatch(rb"[ \0]*\r?\n?", content[behind : max(start, 0)]) or start < behind:
@@ -183,7 +172,7 @@ def _sfmov(path: Path, memory: float) -> tuple[Counts, Array | None]:
     notes = path.with_suffix(".inc")
     is_short = notes.is_file() and notes.stat().st_size <= _LONGEST
     rate = float(_lines(notes.read_bytes()).get("FRate_0", 0.0)) if is_short else 0.0
-    return recordings.film(counts), np.arange(frames) / rate if rate > 0.0 else None
+    return _recording.film(counts), np.arange(frames) / rate if rate > 0.0 else None
 
 
 def _lines(header: bytes) -> dict[str, str]:
@@ -213,4 +202,4 @@ def _hcc(path: Path, memory: float) -> tuple[Counts, Array | None]:
     times = headers["seconds"] - float(first["seconds"][0]) + 1e-7 * headers["fraction"]
     if not np.ptp(times) and (rate := 1e-3 * float(first["rate"][0])) > 0.0:
         times = np.arange(len(frames)) / rate
-    return recordings.film(frames["counts"]), times if np.ptp(times) else None
+    return _recording.film(frames["counts"]), times if np.ptp(times) else None

@@ -14,8 +14,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import xarray as xr
 
-from dbthermal import _text as texts
-from dbthermal import schema
+from dbthermal import _text, schema
 from dbthermal._arrays import Array
 
 _KEYS: Final = (
@@ -76,17 +75,17 @@ def ecostress(path: str | Path) -> xr.Dataset:
     ...     ecostress(path).emissivity.values.tolist()
     [0.96, 0.75, 0.9]
     """
-    path = texts.as_path(path)
-    lines = texts.whole_lines(texts.read_text(path, encoding="latin-1"), path.name)
+    path = _text.as_path(path)
+    lines = _text.whole_lines(_text.read_text(path, encoding="latin-1"), path.name)
     blank = next((i for i, line in enumerate(lines) if not line.strip()), len(lines))
     header = _header(lines[:blank], path)
     rows = [(i, line.split()) for i, line in enumerate(lines, 1) if i > blank and line.strip()]
-    wavelength, reflectance = texts.numbers(rows, 2, path.name).T
+    wavelength, reflectance = _text.numbers(rows, 2, path.name).T
     stated = {"Number of X Values": wavelength.size}
     stated |= {"First X Value": wavelength[0], "Last X Value": wavelength[-1]}
     for key, value in stated.items():
         declared = header.get(key, "")
-        if not abs(texts.number(declared, f"{path.name}, {key}") - value) <= 1e-3:
+        if not abs(_text.number(declared, f"{path.name}, {key}") - value) <= 1e-3:
             label = f"{key} is {value:g}, declared '{declared}'"
             raise ValueError(f"Truncated or altered '{path.name}': {label}. Must be equal.")
     notes = {note: header.get(key, "") for note, key in NOTES.items()}
@@ -97,11 +96,11 @@ class File(NamedTuple):
     """Name and rows of a table."""
 
     name: str
-    rows: Sequence[texts.Row]
+    rows: Sequence[_text.Row]
 
     def at(self, index: np.integer[Any]) -> str:
         """Place of a row in the file."""
-        return texts.at(self.name, self.rows[int(index)][0])
+        return _text.at(self.name, self.rows[int(index)][0])
 
 
 def _header(lines: Sequence[str], path: Path) -> dict[str, str]:
@@ -110,8 +109,8 @@ def _header(lines: Sequence[str], path: Path) -> dict[str, str]:
         key, colon, text = line.partition(":")
         if not colon or key.strip() in header:
             rule = "Must be a key that is listed once, a colon and a text"
-            place = texts.at(path.name, number)
-            raise ValueError(f"{place}: Invalid header {texts.shown(line)}. {rule}.")
+            place = _text.at(path.name, number)
+            raise ValueError(f"{place}: Invalid header {_text.shown(line)}. {rule}.")
         header[key.strip()] = " ".join(text.split())
     for key, rule in _HEADER_RULES.items():
         if not re.search(rule, text := header.get(key, ""), re.IGNORECASE):

@@ -16,8 +16,7 @@ import numpy as np
 import xarray as xr
 
 from dbthermal._arrays import Array, empty, release
-from dbthermal.readers import _formats as formats
-from dbthermal.readers import _recording as recordings
+from dbthermal.readers import _formats, _recording
 from dbthermal.readers._formats import Paths
 from dbthermal.readers._recording import MEMORY, Clock, Counts
 
@@ -115,9 +114,9 @@ def tiff(
     >>> bool((capture.counts == frames).all()), capture.time.values.round(3).tolist()  # [s]
     (True, [0.0, 0.033])
     """
-    paths = formats.files(path, "tiff")
-    name = recordings.label(paths)
-    recordings.check_unit(unit, name)
+    paths = _formats.files(path, "tiff")
+    name = _recording.label(paths)
+    _recording.check_unit(unit, name)
     # Pages of one size, and the memory that they take.
     pages = [page for file in paths for page in _pages(file)]
     for page in pages:
@@ -126,9 +125,9 @@ def tiff(
             raise ValueError(f"{label}. Must be {pages[0].shape}, as the first.")
     shape = (sum(page.images for page in pages), *pages[0].shape)
     stored = sum(length for page in pages for _, length in page.spans)
-    recordings.check_memory(shape, memory, name, stored)
+    _recording.check_memory(shape, memory, name, stored)
     seconds, sentences = _times(pages[0].description, shape[0], clock, name)
-    places = recordings.numbered(paths) if np.ndim(np.asarray(clock)) == 0 else None
+    places = _recording.numbered(paths) if np.ndim(np.asarray(clock)) == 0 else None
     groups = groupby(pages, attrgetter("path"))
     size, *lengths = (sum(page.images for page in group) for _, group in groups)
     if places is not None and {*lengths[:-1]} <= {size}:  # the last stack may be shorter
@@ -146,15 +145,15 @@ def tiff(
             flat[at : at + values.size] = values
             at += values.size
             release()
-    recordings.check_present(counts, sorted({v for page in pages for v in page.missing}), name)
+    _recording.check_present(counts, sorted({v for page in pages for v in page.missing}), name)
     twins = [n for n in range(1, len(paths)) if np.array_equal(*counts[n - 1 : n + 1])]
     if twins and len(counts) == len(paths):
         label = f"'{paths[twins[0] - 1].name}' and '{paths[twins[0]].name}', {len(twins)} in all"
         sentences.append(f"Same counts in {label}. Must be different frames: is one a copy?")
-    order = " and ".join(sorted({recordings.ORDERS[page.order] for page in pages}))
+    order = " and ".join(sorted({_recording.ORDERS[page.order] for page in pages}))
     decided = {"byte_order": order, "byte_order_by": "header"}
     form = "PNG" if pages[0].codec == "png" else "TIFF"
-    return recordings.clocked(counts, seconds, name, *sentences, format=form, **decided)
+    return _recording.clocked(counts, seconds, name, *sentences, format=form, **decided)
 
 
 def _times(text: str, frames: int, clock: Clock | None, name: str) -> tuple[Array, list[str]]:
@@ -164,9 +163,9 @@ def _times(text: str, frames: int, clock: Clock | None, name: str) -> tuple[Arra
     times = np.array(_TIMES.findall(text), dtype=np.float64)
     times = times if times.size == frames else np.multiply(interval, np.arange(frames))
     if times.any():
-        stated = recordings.check_times(times, unit, clock, name)
-        return recordings.stamps(stated if clock is None else clock, frames, name), []
-    seconds = recordings.stamps(clock, frames, name)
+        stated = _recording.check_times(times, unit, clock, name)
+        return _recording.stamps(stated if clock is None else clock, frames, name), []
+    seconds = _recording.stamps(clock, frames, name)
     differs = rate and abs((frames - 1) / rate - seconds[-1]) > 0.5 / rate
     rule = "Must be the rate of recording; that in the file may be of playing it"
     sentence = f"'{name}' states {rate:g} frames a second, and clock= another rate. {rule}."
@@ -191,7 +190,7 @@ class _Page(NamedTuple):
 def _values(page: _Page) -> Iterator[Counts]:
     """Yield the counts of the spans of a page; what is compressed must be of the right length."""
     if page.codec == "png":
-        yield recordings.png(page.path.read_bytes(), f"'{page.path.name}'").ravel()
+        yield _recording.png(page.path.read_bytes(), f"'{page.path.name}'").ravel()
         return
     for number, (start, length) in enumerate(page.spans):
         if not page.codec:
@@ -202,8 +201,8 @@ def _values(page: _Page) -> Iterator[Counts]:
         stored = np.fromfile(page.path, np.uint8, length, offset=start).tobytes()
         rows = min(page.rows, page.shape[0] - number * page.rows)
         size = 2 * rows * page.shape[1]
-        decode = getattr(recordings.optional("imagecodecs", "recordings"), f"{page.codec}_decode")
-        with recordings.damage_named(f"Damaged TIFF '{page.path.name}'", f"whole {page.codec}"):
+        decode = getattr(_recording.optional("imagecodecs", "recordings"), f"{page.codec}_decode")
+        with _recording.damage_named(f"Damaged TIFF '{page.path.name}'", f"whole {page.codec}"):
             content = decode(stored, out=size + 1)  # and no more
         if len(content) != size:
             label = f"{len(content)} bytes of a strip of '{page.path.name}'"
@@ -216,11 +215,11 @@ def _values(page: _Page) -> Iterator[Counts]:
 
 def _pages(path: Path) -> list[_Page]:
     """Pages of a file, which must be as many as its description states."""
-    if formats.format_of(path) == "PNG":
+    if _formats.format_of(path) == "PNG":
         with path.open("rb") as stream:
-            rows, columns, _ = recordings.png_size(stream.read(32), f"'{path.name}'")
+            rows, columns, _ = _recording.png_size(stream.read(32), f"'{path.name}'")
         return [_Page(path, (rows, columns), 1, ">", [(0, path.stat().st_size)], [], "png")]
-    tifffile = recordings.optional("tifffile", "recordings")
+    tifffile = _recording.optional("tifffile", "recordings")
     size, pages, total = path.stat().st_size, list[_Page](), 0
     # Complaints that tifffile logs, without an error.
     complaints, log = SimpleQueue[logging.LogRecord](), logging.getLogger("tifffile")
@@ -230,7 +229,7 @@ def _pages(path: Path) -> list[_Page]:
     try:
         with tifffile.TiffFile(path) as file:
             for number, page in enumerate(file.pages):
-                recordings.check_pieces(number + 1, size, f"pages of '{path.name}'")
+                _recording.check_pieces(number + 1, size, f"pages of '{path.name}'")
                 pages.append(_page(page, path, file.byteorder, number))
                 total += sum(length for _, length in pages[-1].spans)
                 total += sum(tag.valuebytecount for tag in page.tags)
@@ -238,13 +237,13 @@ def _pages(path: Path) -> list[_Page]:
                     raise ValueError(f"{total} bytes of pixels, tags. Must fit into its {size}.")
             description = str(file.pages[0].description)
             if stated_unit := _TEMPERATURES.search(description):
-                recordings.check_unit(stated_unit.group(1), path.name)
+                _recording.check_unit(stated_unit.group(1), path.name)
             stated = _stated(description)
             pages[0] = pages[0]._replace(description=description)
             if not complaints.empty():  # which tifffile logs, and goes on
                 raise ValueError(complaints.get().getMessage())
             _check_apart(file, pages)
-    except recordings.DAMAGE as error:
+    except _recording.DAMAGE as error:
         refused = "Must " in str(error)
         state, rule = ("Invalid", "") if refused else ("Damaged", ". Must be whole, or BigTIFF.")
         raise ValueError(f"{state} TIFF '{path.name}': {error}{rule}") from error
@@ -300,7 +299,7 @@ def _page(page: Any, path: Path, order: str, number: int) -> _Page:
         raise ValueError(f"Invalid {label}. Must be none, or one without loss: {_LOSSLESS}.")
     # Places of its pixels, joined where they follow one another.
     shape = (int(page.imagelength), int(page.imagewidth))
-    recordings.check_pieces(len(page.dataoffsets), 2 * math.prod(shape), f"strips of page {number}")
+    _recording.check_pieces(len(page.dataoffsets), 2 * math.prod(shape), f"strips of page {number}")
     spans = list[tuple[int, int]]()
     for start, length in zip(page.dataoffsets, page.databytecounts, strict=True):
         odd = length % 2 and not codec

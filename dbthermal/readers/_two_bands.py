@@ -14,7 +14,7 @@ from dbthermal import schema
 from dbthermal._arrays import empty, parts
 from dbthermal._text import shown
 from dbthermal._warnings import warned
-from dbthermal.readers import _recording as recordings
+from dbthermal.readers import _recording
 from dbthermal.readers._recording import FileFlag
 
 _SCENE: Final = (5.0, 100.0)  # temperatures of a scene [degC]
@@ -139,7 +139,7 @@ def _offsets(cameras: Sequence[xr.Dataset], offset: Any) -> list[float]:
         return [(date - begun).total_seconds() for date in later]
     offsets = list(offset) if isinstance(offset, list | tuple) else [offset]
     for value in offsets:
-        recordings.check_number(value, "offset")
+        _recording.check_number(value, "offset")
     if len(offsets) != len(cameras) - 1:
         rule = f"Must be {len(cameras) - 1}, one for each recording after the first"
         raise ValueError(f"Invalid offset {offset} s. {rule}.")

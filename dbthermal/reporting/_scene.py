@@ -1,29 +1,33 @@
 """Report of a separated scene: films, curves of regions, validity, emissivities, assumptions."""
 
+import base64
 import io
 import json
-from collections.abc import Mapping
+import zlib
+from collections.abc import Iterator, Mapping
 from importlib import resources
 from itertools import cycle
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import MappingProxyType
 from typing import Any, Final, Literal
 
 import matplotlib as mpl
+import matplotlib.image
 import numpy as np
+import numpy.typing as npt
 import xarray as xr
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
-from dbthermal import _text as texts
-from dbthermal import emissivity, figures, schema, store
+from dbthermal import _text, emissivity, figures, schema, store
 from dbthermal.explorer import Region, View
 from dbthermal.explorer._answer import SPREAD, answer, nearest
-from dbthermal.explorer._export import sampled
+from dbthermal.explorer._export import Shown, panels, sampled
 from dbthermal.explorer._films import FILMS
+from dbthermal.explorer._view import COMPLETED
 from dbthermal.figures import drawing
 from dbthermal.readers._formats import PNG
-from dbthermal.reporting._films import VIEWED, base64_text, video, viewer
 from dbthermal.schema import Status
 from dbthermal.separation._doubts import against_response, hardly_measured
 
@@ -32,11 +36,18 @@ try:
     from jinja2.utils import htmlsafe_json_dumps
     from markupsafe import Markup
 except ImportError as error:
-    raise ImportError(texts.missing_library(error.name, "report")) from error
+    raise ImportError(_text.missing_library(error.name, "report")) from error
 
 Curves = Mapping[str, Mapping[str, xr.Dataset]]
 
 _LOGO: Final = 2**20  # largest picture beside the title [byte]
+_FILMED: Final = 240  # frames of the video, at most; half as many while it is larger than:
+_LARGEST: Final = 3_000_000  # [byte]
+_FASTEST: Final = 30.0  # Hz
+_SAMPLES: Final = 600_000  # of each film in the viewer, at most, and of these frames:
+VIEWED: Final = 80
+_NO_VALUE: Final = 65535  # of 16 bits
+_LEAST: Final = 0.01  # between both ends of the colours [K]
 
 
 def report(  # noqa: PLR0913 - what is shown beside the result, by name
@@ -76,24 +87,18 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
     materials : Dataset, optional
         Stage `emissivity_table`, whose nearest materials are named; `emissivity.embedded_table` if
         not given.
-    title, author : str
-        Heading, and a name below it.
-    logo : str or Path, optional
-        File ``*.png`` of at most 1 MB, shown beside the heading.
-    provenance : mapping, optional
-        From `store.provenance`; that of the result if not given.
-    celsius : bool
-        Temperatures in degrees Celsius instead of kelvin.
+    title, author, logo : str, str, str or Path
+        Heading; a name below it; file ``*.png`` of at most 1 MB, shown beside it.
+    provenance, celsius : mapping, bool
+        From `store.provenance`, by default that of the result; degrees Celsius instead of kelvin.
     codec : {"h264", "vp9"}
         Compression of the film. H.264 plays in every browser; see `store.save_video`.
 
     Raises
     ------
-    ImportError
-        If a library of the extra `report` is not installed.
-    TypeError, ValueError
-        As `explorer.View`; if there is no object temperature, a region is not one, or the path has
-        another ending.
+    ImportError, TypeError, ValueError
+        If a library of the extra `report` is not installed; as `explorer.View`; if there is no
+        object temperature, a region is not one, or the path has another ending.
 
     Examples
     --------
@@ -170,7 +175,7 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
         spread=SPREAD,
         attrs=result.attrs,
         events=", ".join(f"{name} ({moment:.1f} s)" for name, moment in view.events.items()),
-        text=_text,
+        text=_shown,
         provenance=json.dumps(made_by, indent=2, sort_keys=True),
         script=Markup(script.read_text("utf-8")),
         json=lambda value: htmlsafe_json_dumps(value, allow_nan=False, sort_keys=True),
@@ -192,7 +197,7 @@ def _chosen(view: View, regions: Mapping[str, Region]) -> dict[str, Region]:
 
 def _picture(logo: str | Path) -> bytes:
     """Bytes of a logo, a PNG."""
-    picture = texts.regular_file(logo, _LOGO).read_bytes()
+    picture = _text.regular_file(logo, _LOGO).read_bytes()
     if not picture.startswith(PNG):
         raise ValueError(f"Invalid logo '{logo}'. Must be a PNG.")
     return picture
@@ -295,7 +300,7 @@ def _emissivities(numbers: Mapping[str, Any], *, named: bool) -> list[list[str]]
     rows = []
     for name, of in places.items():
         pairs = zip(of["emissivity"].values(), of["emissivity_std"].values(), strict=True)
-        cells = [f"{_text(value)} \N{PLUS-MINUS SIGN} {_text(std)}" for value, std in pairs]
+        cells = [f"{_shown(value)} \N{PLUS-MINUS SIGN} {_shown(std)}" for value, std in pairs]
         steady = of.get("emissivity_steady_std", {}).values()
         cells = [f"{cell} ({std:.4f})" for cell, std in zip(cells, steady, strict=False)] or cells
         near = [f"{row['material']} ({row['distance']:.1f})" for row in of["nearest"]]
@@ -308,5 +313,86 @@ def _plain(value: Any) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def _text(value: float | None) -> str:
+def _shown(value: float | None) -> str:
     return "no value" if value is None else f"{value:.3f}"
+
+
+def _films(view: View) -> list[str]:
+    """Names of the panes that are shown as films: object and reflected temperature, inputs."""
+    inputs = [name for name in view.panes if name.startswith("input ")]
+    return [*(name for name in FILMS if name in view.panes), *inputs]
+
+
+def base64_text(content: bytes) -> str:
+    """Bytes as a page holds them."""
+    return base64.b64encode(content).decode()
+
+
+def video(
+    view: View, title: str, codec: Literal["vp9", "h264"], *, celsius: bool, number: int = _FILMED
+) -> dict[str, str]:
+    """Film of the object, what it reflects, and the inputs, with its middle frame."""
+    shown = Shown(_films(view), 0, {}, celsius)
+    pictures = panels(view, shown, number, number * 100_000)
+    span, count = float(np.ptp(view.time)), pictures[0].values.sizes["time"]
+    rate = min(_FASTEST, max(1.0, (count - 1) / span)) if span else 1.0
+    middle: list[npt.NDArray[np.uint8]] = []
+
+    def frames() -> Iterator[npt.NDArray[np.uint8]]:
+        """Frames of the film, of which the middle one is kept."""
+        for index, frame in enumerate(figures.film(pictures, title=title)):
+            if index == count // 2:
+                middle.append(frame)
+            yield frame
+
+    with TemporaryDirectory() as folder:
+        path, poster = Path(folder) / "film.mp4", Path(folder) / "middle.png"
+        store.save_video(frames(), path, {}, rate=rate, codec=codec)
+        if path.stat().st_size > _LARGEST and number > 2:
+            return video(view, title, codec, celsius=celsius, number=number // 2)
+        mpl.image.imsave(poster, middle[0])
+        film, still = (base64_text(file.read_bytes()) for file in (path, poster))
+    return {"film": film, "still": still}
+
+
+def viewer(view: View, *, celsius: bool) -> dict[str, Any]:
+    """Viewer of some frames and pixels of the films, and of the curve of each pixel."""
+    quantities, step, time = [], 1, view.time
+    stds = [f"{name}_std" for name in FILMS]
+    for name in [*_films(view), *(name for name in stds if name in view.panes)]:
+        pane = view.panes[name]
+        film, step = sampled(view, name, VIEWED, _SAMPLES, celsius=celsius)
+        values, time = film.values.astype(np.float64), film["time"].values
+        finite = values[np.isfinite(values)]
+        low, high = (finite.min(), finite.max()) if finite.size else (0.0, 1.0)
+        shown = np.percentile(finite, [1, 99]).tolist() if finite.size else [low, high]
+        shown = [0.0 if name in stds else shown[0], max(shown[1], shown[0] + _LEAST)]
+        high = high if high > low else low + 1.0
+        scaled = np.nan_to_num((values - low) / (high - low)) * (_NO_VALUE - 1)
+        codes = np.where(np.isfinite(values), np.rint(scaled), _NO_VALUE).astype("<u2")
+        # Changes from frame to frame, low bytes before high ones, which compress well.
+        changes = np.diff(codes, axis=0, prepend=np.zeros_like(codes[:1])).astype("<u2")
+        planes = changes.view("u1").reshape(-1, 2).T.tobytes()
+        quantity: Any = {"name": name, "label": pane.label, "unit": pane.unit(celsius=celsius)[0]}
+        quantity |= {"low": float(low), "high": float(high), "shown": shown}
+        quantities.append({**quantity, "data": base64_text(zlib.compress(planes, 9))})
+    colors = np.rint(255 * mpl.colormaps["inferno"](np.linspace(0, 1, 256))[:, :3]).astype(np.uint8)
+    # Pixels that are completed (1), or have another flag (2).
+    status = view.status[::step, ::step]
+    completed = (status & COMPLETED) != 0
+    marks = np.where(completed, 1, np.where(status != 0, 2, 0)).astype(np.uint8)
+    content = {
+        "marks": base64_text(marks.tobytes()),
+        "height": -(-view.shape[0] // step),
+        "width": -(-view.shape[1] // step),
+        "step": step,
+        "times": [float(moment) for moment in time],
+        "palette": base64_text(colors.tobytes()),
+        "quantities": quantities,
+    }
+    share = f"one row and column of {step}, " if step > 1 else ""
+    note = (
+        "Click a pixel for its curve. White lines: completed, not measured. Black lines: flagged. "
+        f"Shown: {share}{time.size} of {view.time.size} frames."
+    )
+    return {"content": content, "text": note}

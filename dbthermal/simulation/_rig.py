@@ -24,20 +24,14 @@ class Rig:
 
     Attributes
     ----------
-    bands : tuple of str
-        Names in `bands.FILTERS`.
-    noise : tuple of float
-        Noise of each band, as NETD near 25 degrees Celsius [K].
-    counts_per_kelvin : float
-        Slope of the 8-14 um band at 300 K [count/K].
-    offset : float
-        Counts of a body at 0 K [count].
+    bands, noise : tuple of str, tuple of float
+        Names in `bands.FILTERS`; noise of each band, as NETD near 25 degrees Celsius [K].
+    counts_per_kelvin, offset : float
+        Slope of the 8-14 um band at 300 K [count/K]; counts of a body at 0 K [count].
     lowest, highest : float
         Range of the simulated response [K].
-    gain_std, offset_std : float
-        Fixed pattern from pixel to pixel: relative gain [1] and offset [count].
-    bad_fraction : float
-        Fraction of dead pixels [1].
+    gain_std, offset_std, bad_fraction : float
+        Fixed pattern of pixels: relative gain [1], offset [count]; share of dead pixels [1].
 
     Examples
     --------
@@ -78,11 +72,9 @@ class Rig:
         """
         temperature = np.linspace(self.lowest, self.highest, _CALIBRATION_POINTS)
         unit = self.counts_per_kelvin / bands.get("8-14").slope(_SLOPE_TEMPERATURE)
-        counts = xr.DataArray(
-            [self.offset + unit * bands.get(name).radiance(temperature) for name in self.bands],
-            dims=("band", "temperature"),
-            coords={"band": list(self.bands), "temperature": temperature},
-        )
+        values = [self.offset + unit * bands.get(name).radiance(temperature) for name in self.bands]
+        axes = {"band": list(self.bands), "temperature": temperature}
+        counts = xr.DataArray(values, axes, ("band", "temperature"))
         noiseless = calibration.fit_response(counts)
         # Noise in counts: NETD times the slope of the response near 25 degrees Celsius.
         slopes = [curve.reference_slope for curve in responses.curves(noiseless, self.bands)]
@@ -122,10 +114,8 @@ def observe(
         cameras see it that stand side by side.
     response : Dataset
         With `noise`, e.g. from `Rig.response`.
-    rng : Generator
-        Source of the noise.
-    dtype : str
-        Floating dtype of the counts.
+    rng, dtype : Generator, str
+        Source of the noise; floating dtype of the counts.
 
     Examples
     --------
@@ -166,12 +156,8 @@ def pattern(rig: Rig, shape: tuple[int, int], rng: np.random.Generator) -> xr.Da
 
     Parameters
     ----------
-    rig : Rig
-        Its bands and deviations.
-    shape : tuple of int
-        Rows and columns.
-    rng : Generator
-        Source of all randomness.
+    rig, shape, rng : Rig, tuple of int, Generator
+        Bands and deviations; rows and columns; source of all randomness.
 
     Returns
     -------
@@ -191,15 +177,10 @@ def pattern(rig: Rig, shape: tuple[int, int], rng: np.random.Generator) -> xr.Da
         np.mean(image, axis=(1, 2), where=~dead, keepdims=True) for image in (gain, offset)
     )
     dims = ("band", "y", "x")
-    return xr.Dataset(
-        {
-            "gain": (dims, 1.0 + gain - mean_gain, {"units": "1"}),
-            "offset": (dims, offset - mean_offset, {"units": "count"}),
-            "dead": (dims, dead),
-        },
-        coords={"band": list(rig.bands)},
-        attrs={"origin": "simulated"},
-    )
+    maps: dict[str, Any] = {"gain": (dims, 1.0 + gain - mean_gain, {"units": "1"})}
+    maps["offset"] = (dims, offset - mean_offset, {"units": "count"})
+    maps["dead"] = (dims, dead)
+    return xr.Dataset(maps, {"band": list(rig.bands)}, {"origin": "simulated"})
 
 
 def capture(corrected: xr.Dataset, detector: xr.Dataset) -> xr.Dataset:
@@ -239,14 +220,10 @@ def blackbody_movies(
 
     Parameters
     ----------
-    rig : Rig
-        The rig.
-    temperatures : ndarray
-        Blackbody temperatures [K], increasing, within the rig's range.
-    frames : int
-        Frames at each.
-    detector : Dataset
-        From `pattern`.
+    rig, detector : Rig, Dataset
+        The rig, and its `pattern`.
+    temperatures, frames : ndarray, int
+        Blackbody temperatures [K], increasing, within the rig's range; frames at each.
     rng : Generator
         Source of the noise.
 

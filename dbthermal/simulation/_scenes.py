@@ -23,18 +23,12 @@ class Background:
     kind : {"pulses", "random walk", "still"}
         People who walk by now and then; a background that never rests (a first-order
         autoregressive process); or a constant one.
-    level : float
-        Resting temperature [K].
-    amplitude : float
-        Height of a pulse, or standard deviation of the walk [K].
-    count : tuple of int
-        Fewest and most pulses in the capture.
-    duration : tuple of float
-        Shortest and longest pulse [s].
-    correlation_time : float
-        Correlation time of the walk [s].
-    drift : float
-        Change of the resting temperature over the capture, linear in time [K].
+    level, drift : float
+        Resting temperature, and its change over the capture, linear in time [K].
+    amplitude, correlation_time : float
+        Height of a pulse, or standard deviation of the walk [K]; correlation time of the walk [s].
+    count, duration : tuple of int, tuple of float
+        Fewest and most pulses in the capture; shortest and longest pulse [s].
     """
 
     kind: str = "pulses"
@@ -96,12 +90,10 @@ def heating(time: Array, start: float, stop: float, time_constant: npt.ArrayLike
 
     Parameters
     ----------
-    time : ndarray, shape (time,)
-        Times [s], two or more, increasing.
+    time, time_constant : ndarray, array_like
+        Times (time,) [s], two or more, increasing; time constants (...), positive [s].
     start, stop : float
         First and last temperature [K].
-    time_constant : array_like, shape (...)
-        Time constants, positive [s].
 
     Examples
     --------
@@ -122,10 +114,8 @@ def scene(
 
     Parameters
     ----------
-    time : Array
-        Times (time,) [s], two or more, increasing.
-    object_temperature, background_temperature : Array
-        Temperatures (time, y, x), positive [K].
+    time, object_temperature, background_temperature : Array
+        Times (time,) [s], two or more, increasing; temperatures (time, y, x), positive [K].
     emissivity : DataArray
         Emissivity (band) or (band, y, x), in [0, 1], or a ValueError [1].
 
@@ -146,12 +136,9 @@ def scene(
         "background_temperature": background_temperature,
         "emissivity": np.broadcast_to(values, (emissivity.shape[0], height, width)),
     }
-    coords = {"time": ("time", time, {"units": "s"}), "y": np.arange(height), "x": np.arange(width)}
-    return xr.Dataset(
-        schema.variables("separated", films),
-        {"band": emissivity["band"].values, **coords},
-        {"origin": "simulated"},
-    )
+    axes = {"band": emissivity["band"].values, "time": ("time", time, {"units": "s"})}
+    axes |= {"y": np.arange(height), "x": np.arange(width)}
+    return xr.Dataset(schema.variables("separated", films), axes, {"origin": "simulated"})
 
 
 def side_by_side(emissivity: xr.DataArray, shape: tuple[int, int]) -> xr.DataArray:
@@ -159,19 +146,14 @@ def side_by_side(emissivity: xr.DataArray, shape: tuple[int, int]) -> xr.DataArr
 
     Parameters
     ----------
-    emissivity : DataArray
-        Emissivity (material, band) [1].
-    shape : tuple of int
-        Rows and columns of the image.
+    emissivity, shape : DataArray, tuple of int
+        Emissivity (material, band) [1]; rows and columns of the image.
     """
     panel = np.arange(shape[1]) * emissivity.sizes["material"] // shape[1]
     columns = emissivity.values[panel].T[:, np.newaxis, :]
-    return xr.DataArray(
-        np.broadcast_to(columns, (emissivity.sizes["band"], *shape)),
-        dims=("band", "y", "x"),
-        coords={"band": emissivity["band"].values},
-        attrs={"units": "1"},
-    )
+    image = np.broadcast_to(columns, (emissivity.sizes["band"], *shape))
+    axes = {"band": emissivity["band"].values}
+    return xr.DataArray(image, axes, ("band", "y", "x"), attrs={"units": "1"})
 
 
 def independent_pixels(
@@ -189,20 +171,12 @@ def independent_pixels(
 
     Parameters
     ----------
-    time : ndarray, shape (time,)
-        Times [s].
-    emissivity : DataArray
-        (band) [1].
-    background : Background
-        Variation of the background.
-    pixels : int
-        Number of pixels.
-    rng : Generator
-        Source of randomness.
-    start, stop : float
-        First and last object temperature [K].
-    time_constant : tuple of float
-        Range of the heating's time constant [s].
+    time, emissivity : ndarray, DataArray
+        Times (time,) [s]; emissivity (band) [1].
+    background, pixels, rng : Background, int, Generator
+        Variation of the background; number of pixels; source of randomness.
+    start, stop, time_constant : float, float, tuple of float
+        First and last object temperature [K]; range of the heating's time constant [s].
     """
     constants = rng.uniform(*time_constant, pixels)
     warm = heating(time, start, stop, constants)
@@ -220,32 +194,22 @@ def walkers(
     crossings: int = 7,
     time_constant: float = 12.0,
 ) -> xr.Dataset:
-    """Plate, heated in its middle, that reflects people who walk by.
+    """Plate, heated in its middle, that reflects people who walk by: its `scene`.
 
     Each person is an upright ellipse with a head, warmer than the room, that crosses the view once
     at a steady pace.
 
     Parameters
     ----------
-    time : ndarray, shape (time,)
-        Times [s].
-    shape : tuple of int
-        Rows and columns.
+    time, shape : ndarray, tuple of int
+        Times (time,) [s]; rows and columns.
     emissivity : DataArray
         (band) or (band, y, x) [1].
-    rng : Generator
-        Source of the paths.
-    temperatures : sequence of float
-        Temperatures of the room, of people, and of the plate's middle at the end [K].
-    crossings : int
-        Number of people.
-    time_constant : float
-        Time constant of the heating [s].
-
-    Returns
-    -------
-    Dataset
-        The scene, see `scene`.
+    rng, crossings : Generator, int
+        Source of the paths; number of people.
+    temperatures, time_constant : sequence of float, float
+        Temperatures of the room, of people, and of the plate's middle at the end [K]; time constant
+        of the heating [s].
 
     Examples
     --------
@@ -259,23 +223,17 @@ def walkers(
     >>> dict(capture["counts"].sizes)
     {'band': 2, 'time': 50, 'y': 24, 'x': 32}
     """
-    level, skin, hottest = _numbers.real_numbers(
-        "temperatures [K]", temperatures, _numbers.KELVIN, (3,)
-    )
-    height, width = shape
-    rows, columns = np.meshgrid(
-        np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij"
-    )
+    stated = _numbers.real_numbers("temperatures [K]", temperatures, _numbers.KELVIN, (3,))
+    level, skin, hottest = stated
+    rows, columns = np.meshgrid(*(np.linspace(-1, 1, n) for n in shape), indexing="ij")
     # Object: heated in its middle.
     profile = np.exp(-(rows**2 + columns**2) / (2 * 0.5**2))
     curve = heating(time, 0.0, hottest - level, time_constant)
     warm = level + curve[:, np.newaxis, np.newaxis] * profile
     cold = np.full(warm.shape, level)
     # Background: each person crosses the view once.
-    starts = (
-        time[0] + (time[-1] - time[0]) * (np.arange(crossings) + rng.random(crossings)) / crossings
-    )
-    for start in starts:
+    places = np.arange(crossings) + rng.random(crossings)
+    for start in time[0] + (time[-1] - time[0]) * places / crossings:
         pace = rng.choice([-1.0, 1.0]) * rng.uniform(0.6, 1.2)
         centre = np.sign(pace) * -1.6 + pace * (time - start)
         half = 0.30  # of the body's width

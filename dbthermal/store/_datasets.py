@@ -26,8 +26,7 @@ from dbthermal.store._whole import whole
 
 # Next to no time beside that of the writing, and smaller than Zstandard without a shuffle of bytes.
 _COMPRESSORS = (BloscCodec(cname="lz4", clevel=1, shuffle="shuffle"), Crc32cCodec())
-_CHUNK_BYTES: Final = 2**20
-"""Least size of a full chunk [byte]: below about 1 MB a read costs more in files than in bytes."""
+_CHUNK_BYTES: Final = 2**20  # of a full chunk, at least: below, a read costs more in files
 
 # Names of variables, which are folders on any disk; coordinates are listed, parted by spaces.
 _NAME: Final = re.compile(
@@ -47,9 +46,8 @@ def _chunks(
     """Chunk sizes for a variable: pieces of rows, whole in every dimension but y and x.
 
     Every stage works pixel by pixel on all frames and bands, and reads rows of the image: a chunk
-    is the fewest whole rows that have `_CHUNK_BYTES` before compression, or equal parts of one. Its
-    frames are then long runs of the array, copied at twice the rate of a square tile's. Chunks
-    divide a `height` and `length` of rows, if there is one, so that a part's next begins with one.
+    is the fewest whole rows that have `_CHUNK_BYTES` before compression, or equal parts of one, for
+    long runs of memory. Chunks divide a `height` and `length`, so that a next part begins one.
     """
     sizes = {str(dim): max(1, size) for dim, size in variable.sizes.items()}
     for dim, size in (("y", height), ("x", length)):
@@ -76,10 +74,9 @@ def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -
         Of any stage; it is not changed. TypeError for a DataArray and for values or attributes that
         zarr cannot hold, ValueError for attributes by which other values would be opened, such as
         `_FillValue`, `scale_factor` and times since a date.
-    path : str or Path
-        Folder ``*.zarr`` (ValueError if it has another suffix). Its parents are made.
-    provenance : mapping
-        From `dbthermal.store.provenance`; becomes ``attrs["provenance"]``.
+    path, provenance : str or Path, mapping
+        Folder ``*.zarr`` (ValueError if it has another suffix), whose parents are made; record from
+        `dbthermal.store.provenance`, which becomes ``attrs["provenance"]``.
 
     Examples
     --------
@@ -94,7 +91,7 @@ def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -
     """
     if not isinstance(dataset, xr.Dataset):
         raise TypeError(f"Invalid dataset of type {type(dataset).__name__}. Must be a Dataset.")
-    _save([dataset], path, provenance, None)
+    _save([dataset], path, provenance)
 
 
 def save_rows(
@@ -114,11 +111,9 @@ def save_rows(
         and for a block of other variables, coordinates or units.
     path, provenance : str or Path, mapping
         See `save`.
-    height : int, optional
-        Rows of each block; the last may have fewer. That of the first block by default. For
-        `join_parts` all folders have the same.
-    width : int, optional
-        Columns of each folder, for `join_parts` along x; the last may have fewer.
+    height, width : int, optional
+        Rows of each block, by default of the first, and columns of each folder for `join_parts`
+        along x; all folders have the same, only the last may have fewer.
 
     Examples
     --------
@@ -141,11 +136,7 @@ def save_rows(
 
 
 def _save(
-    blocks: Iterable[xr.Dataset],
-    path: str | Path,
-    provenance: Any,
-    height: int | None,
-    width: int | None = None,
+    blocks: Iterable[xr.Dataset], path: str | Path, provenance: Any, *sizes: int | None
 ) -> None:
     """Save blocks of rows, of a height and width that chunks then divide."""
     if not isinstance(provenance, Mapping):
@@ -163,7 +154,7 @@ def _save(
             # Of all kinds of text zarr's format 3 specifies only that of variable length.
             plain = _with_text_as(rows.drop_encoding(), "U", np.dtypes.StringDType())
             plain.attrs = attrs  # of each part, or those of the store would be lost
-            chunks = {n: _chunks(array, height, width) for n, array in plain.variables.items()}
+            chunks = {n: _chunks(array, *sizes) for n, array in plain.variables.items()}
             encoding = {n: {"chunks": c, "compressors": _COMPRESSORS} for n, c in chunks.items()}
             options: dict[str, Any] = {"mode": "w-", "encoding": encoding}
             if number > 0:
@@ -174,13 +165,8 @@ def _save(
             for name, array in plain.variables.items():
                 if array.chunks:
                     plain[name] = array.chunk(dict(zip(array.dims, chunks[name], strict=True)))
-            plain.to_zarr(
-                integrity.SummedStore(folder),
-                zarr_format=3,
-                consolidated=False,
-                write_empty_chunks=True,
-                **options,
-            )
+            options |= {"zarr_format": 3, "consolidated": False, "write_empty_chunks": True}
+            plain.to_zarr(integrity.SummedStore(folder), **options)
         (folder / integrity.SUMS).write_bytes(integrity.sums_file(integrity.last_sums(folder)))
 
 
@@ -252,6 +238,11 @@ def open_dataset(path: str | Path) -> xr.Dataset:
     A recording that was cut short, or is being written, opens as far as all bands are valid; its
     attributes have ``complete`` = False and, in ``frames_written``, the end of each band.
 
+    FileNotFoundError if the folder does not exist; ValueError, with file, array and store, if a
+    file of it, or of the valid part of a recording that was cut short, is not as it was written,
+    missing, or foreign; of a chunk, when it is read. UserWarning if the store has no checksums, as
+    of dbthermal 0.1.0, so that damage cannot be seen.
+
     Parameters
     ----------
     path : str or Path
@@ -260,39 +251,24 @@ def open_dataset(path: str | Path) -> xr.Dataset:
     Returns
     -------
     Dataset
-        Identical to the one saved, with ``attrs["provenance"]`` added. Text is of NumPy's
-        fixed-length kind.
-
-    Raises
-    ------
-    FileNotFoundError
-        If the folder does not exist.
-    ValueError
-        With file, array and store, if a file of it, or of the valid part of a recording that was
-        cut short, is not as it was written, missing, or foreign; of a chunk, when it is read.
-
-    Warns
-    -----
-    UserWarning
-        If the store has no checksums, as of dbthermal 0.1.0, so that damage cannot be seen.
-
-    Examples
-    --------
-    >>> import xarray as xr
-    >>> from tempfile import TemporaryDirectory
-    >>> from dbthermal import store
-    >>> wall = xr.Dataset({"object_temperature": ("time", [295.2, 295.3], {"units": "K"})})
-    >>> with TemporaryDirectory() as folder:
-    ...     store.save(wall, f"{folder}/wall.zarr", store.provenance({"frames": 2}))
-    ...     saved = store.open_dataset(f"{folder}/wall.zarr").load()
-    >>> saved.equals(wall), saved.attrs["provenance"]["parameters"]
-    (True, {'frames': 2})
+        Identical to the one saved, with ``attrs["provenance"]`` added; see the example of `save`.
+        Text is of NumPy's fixed-length kind.
     """
     if not texts.as_path(path).is_dir():
         rule = "Must be a zarr folder, as `save`, a notebook or a command leaves it"
         raise FileNotFoundError(f"No dataset '{path}'. {rule}.")
     checked = integrity.CheckedStore(path)
-    dataset = _open(checked) if checked.closed else _open_valid_part(checked)
+    if checked.closed:
+        dataset = _open(checked)
+    else:  # a recording, whose variables differ in their room while it grows: one by one
+        ends = {"time": min(checked.attrs["frames_written"].values())}  # of all bands
+        ends["log"] = checked.attrs["log_written"]
+        names = {array.parent.name for array in checked.root.glob("*/zarr.json")}
+        opened = (_open(checked, leave=names - {name}) for name in sorted(names))
+        valid = {dim: slice(end) for dim, end in ends.items()}
+        arrays = [array.isel(valid, missing_dims="ignore") for array in opened]
+        # The attributes as checked, for they may have gone on since.
+        dataset = xr.merge(arrays, combine_attrs="override").assign_attrs(checked.attrs)
     for name in integrity.MARK:
         dataset.attrs.pop(name, None)
     return _with_text_as(dataset, "T", np.dtype(str))
@@ -305,20 +281,6 @@ def _open(checked: integrity.CheckedStore, leave: Iterable[str] = ()) -> xr.Data
     return dataset
 
 
-def _open_valid_part(checked: integrity.CheckedStore) -> xr.Dataset:
-    """Open the variables of a recording one by one, for their room differs while it grows."""
-    ends = {"time": min(checked.attrs["frames_written"].values())}  # of all bands
-    ends["log"] = checked.attrs["log_written"]
-    names = {array.parent.name for array in checked.root.glob("*/zarr.json")}
-    opened = (_open(checked, leave=names - {name}) for name in sorted(names))
-    arrays = [
-        array.isel({dim: slice(end) for dim, end in ends.items()}, missing_dims="ignore")
-        for array in opened
-    ]
-    # The attributes as checked, for they may have gone on since.
-    return xr.merge(arrays, combine_attrs="override").assign_attrs(checked.attrs)
-
-
 def join_parts(
     folders: Iterable[str | Path], path: str | Path, dim: Literal["y", "x"] = "y"
 ) -> None:
@@ -329,10 +291,8 @@ def join_parts(
     folders : iterable of str or Path
         From `save_rows`, all of one `height` or `width` except the last. They stay as they are; on
         a disk without hard links their chunks are copied.
-    path : str or Path
-        Folder ``*.zarr`` of the whole, with the attributes of the first.
-    dim : {"y", "x"}
-        Along which they follow.
+    path, dim : str or Path, {"y", "x"}
+        Folder ``*.zarr`` of the whole, with the attributes of the first; along which they follow.
 
     Examples
     --------

@@ -6,10 +6,9 @@ that is cut short at any moment has the lines of all that is valid. A file that 
 line for each state until the recording is closed. A file that is damaged, cut, missing, foreign or
 in another's place is then seen: metadata and names when the store is opened, values when read.
 
-The codec crc32c of zarr with a check of missing chunks sees every damaged and missing chunk, but
-passed 29 of 240 flipped bits of metadata (20 with other values), exchanged chunks, edited
-attributes, arrays that were lost or renamed, and foreign files; of a recording cut short it sees no
-missing chunk, for its empty room has none either. This list refused each of them.
+The codec crc32c of zarr sees every damaged chunk, but not flipped bits of metadata, exchanged
+chunks, edited attributes, arrays that were lost or renamed, and foreign files; nor, in a recording
+that was cut short, a missing chunk. This list refused each of them.
 """
 
 import asyncio
@@ -24,8 +23,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
 
-from zarr.abc.store import ByteRequest
-from zarr.core.buffer import Buffer, BufferPrototype
+from zarr.core.buffer import Buffer
 from zarr.storage import LocalStore
 
 from dbthermal import _text as texts
@@ -100,13 +98,7 @@ class CheckedStore(SummedStore):
             rule = "as of dbthermal 0.1.0: damage is not seen. Saved again, it has them."
             warnings.warn(f"No checksums in '{self.root}', {rule}", stacklevel=3)
 
-    def get_sync(
-        self,
-        key: str,
-        *,
-        prototype: BufferPrototype | None = None,
-        byte_range: ByteRequest | None = None,
-    ) -> Buffer | None:
+    def get_sync(self, key: str, *, prototype: Any = None, byte_range: Any = None) -> Buffer | None:
         """Read a file that is as it was written."""
         content = super().get_sync(key, prototype=prototype)
         self._compare(key, None if content is None else content.as_numpy_array().data)
@@ -136,7 +128,7 @@ class CheckedStore(SummedStore):
 
         Of a store that grows, all files were on the disk whose lines precede that of its `group`.
         """
-        files, listed = _files(self.root), {key for key, _ in self._sums}
+        files, listed = files_of(self.root), {key for key, _ in self._sums}
         wanted = listed
         if not self.closed:
             wanted = {key for key, _ in takewhile(lambda line: line != group, self._sums)}
@@ -178,11 +170,6 @@ def sums_file(sums: Mapping[str, str]) -> bytes:
     return "".join(f"{key} {sums[key]}\n" for key in sorted(sums)).encode()
 
 
-def missing_files(root: Path) -> list[str]:
-    """Files that were written to a store, and do not exist any more."""
-    return sorted(last_sums(root).keys() - _files(root))
-
-
 def _sum(key: str, content: Content) -> tuple[str, str]:
     return key, f"{zlib.crc32(content):08x}"
 
@@ -202,6 +189,6 @@ def _is_listed(sums: Collection[tuple[str, str]], key: str, content: Content | N
     return _sum(key, content) in sums
 
 
-def _files(root: Path) -> set[str]:
+def files_of(root: Path) -> set[str]:
     """Relative names of all files but that of the checksums."""
     return {*texts.tree_files(root)} - {SUMS}

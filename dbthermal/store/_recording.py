@@ -52,10 +52,8 @@ class Recording:
     variables, sizes : mapping
         Name to `schema.Variable`, of dims (band, time, ...), frame by frame, or (log,), row by row;
         and sizes of their other dims.
-    bands : sequence of str
-        Names of the bands.
-    chunk : int
-        Number of frames that a kill costs at most.
+    bands, chunk : sequence of str, int
+        Names of the bands; number of frames that a kill costs at most.
     attrs, fills : mapping
         Attributes, as JSON; values behind a band's last frame, instead of NaN or 0.
     """
@@ -144,8 +142,12 @@ class Recording:
         """Write rows, (row, ...), of variables at a place from a start on; return their end."""
         stop = start + len(next(iter(block.values())))
         for name, values in block.items():
-            _grow(self._arrays[name], len(place), stop)
-            self._arrays[name][(*place, slice(start, stop))] = values
+            array, axis = self._arrays[name], len(place)
+            size = array.shape[axis]
+            if size < stop:  # twice the room, so that the array's metadata are written seldom
+                room = max(2 * size, -(-stop // chunk) * chunk)
+                array.resize((*array.shape[:axis], room, *array.shape[axis + 1 :]))
+            array[(*place, slice(start, stop))] = values
         # Bring the chunks, their checksums and the folders around them to the disk.
         chunks = [
             self.root.joinpath(name, "c", *map(str, place), str(number))
@@ -190,17 +192,13 @@ class Recording:
                 array.resize(tuple(valid.get(dim, size) for dim, size in sizes))
             # The common clock.
             if time is not None:
-                zarr.create_array(
-                    self._store,
-                    name=integrity.TIME,
-                    data=time.astype(np.float64),
-                    dimension_names=("time",),
-                    attributes={**COORDINATES["time"].attrs, "long_name": "time since the start"},
-                    **_FORM,
-                )
+                about = {**COORDINATES["time"].attrs, "long_name": "time since the start"}
+                form = {"data": time.astype(np.float64), "dimension_names": ("time",), **_FORM}
+                zarr.create_array(self._store, name=integrity.TIME, attributes=about, **form)
                 tree_to_disk([self.root / integrity.TIME, self.root / integrity.SUMS], self.root)
             # Nothing was lost, and one state of every file counts from here on.
-            if lost := integrity.missing_files(self.root):
+            listed = integrity.last_sums(self.root).keys()
+            if lost := sorted(listed - integrity.files_of(self.root)):
                 raise FileNotFoundError(
                     f"No file '{lost[0]}' in the recording '{self.place()}' any more, of "
                     f"{len(lost)} that were deleted. Must stay while it is written to."
@@ -217,24 +215,11 @@ def _create(
     """Make an empty array with room for one chunk of frames, or for no row of the log."""
     chunks = {**sizes, "band": 1, "log": _LOG_CHUNK}
     missing = math.nan if np.dtype(variable.dtype).kind == "f" else 0
-    return group.create_array(
-        name,
-        shape=tuple({**sizes, "log": 0}[dim] for dim in variable.dims),
-        chunks=tuple(chunks[dim] for dim in variable.dims),
-        dtype=variable.dtype,
-        fill_value=missing if fill is None else fill,
-        dimension_names=variable.dims,
-        attributes=dict(variable.attrs),
-        **_FORM,
-    )
-
-
-def _grow(array: Any, axis: int, size: int) -> None:
-    """Make room, twice as much each time, so that the array's metadata are written seldom."""
-    if array.shape[axis] < size:
-        chunk = array.chunks[axis]
-        room = max(2 * array.shape[axis], math.ceil(size / chunk) * chunk)
-        array.resize((*array.shape[:axis], room, *array.shape[axis + 1 :]))
+    form: Any = {"dtype": variable.dtype, "fill_value": missing if fill is None else fill, **_FORM}
+    form |= {"dimension_names": variable.dims, "attributes": dict(variable.attrs)}
+    form["chunks"] = tuple(chunks[dim] for dim in variable.dims)
+    shape = tuple({**sizes, "log": 0}[dim] for dim in variable.dims)
+    return group.create_array(name, shape=shape, **form)
 
 
 class HeldFolder:

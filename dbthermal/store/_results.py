@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from dbthermal import __version__, _numbers
-from dbthermal import _text as texts
+from dbthermal import __version__, _numbers, _text
 from dbthermal.store._whole import whole
 
 if TYPE_CHECKING:
@@ -80,7 +79,7 @@ def checksum(path: str | Path) -> str:
     path : str or Path
         File or folder; FileNotFoundError if it does not exist.
     """
-    path = texts.as_path(path)
+    path = _text.as_path(path)
     if not path.is_dir():
         with path.open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
@@ -127,7 +126,7 @@ def save_text(text: str, path: str | Path, provenance: Mapping[str, Any]) -> Non
     text, path, provenance : str, str or Path, mapping
         Text, file ``*.md`` or ``*.html``; see `save`.
     """
-    suffix = ".html" if texts.as_path(path).suffix == ".html" else ".md"
+    suffix = ".html" if _text.as_path(path).suffix == ".html" else ".md"
     # A string in it can neither end the comment nor begin a tag.
     content = as_json(provenance).replace("--", "-\\u002d").replace("<", "\\u003c")
     with whole(path, suffix) as draft:
@@ -143,13 +142,11 @@ def save_figure(
 
     Parameters
     ----------
-    figure : Figure
-        Of matplotlib; it stays open.
+    figure, dpi : Figure, int
+        Of matplotlib, stays open; resolution [pixel/inch], of the images in PDF and SVG.
     path, provenance : str or Path, mapping
         File ``*.png``, ``*.pdf`` or ``*.svg``; see `save`. The provenance becomes the text chunk
         ``Comment``, the subject or the description, as JSON.
-    dpi : int
-        Resolution [pixel/inch], of the images in PDF and SVG.
 
     Examples
     --------
@@ -164,7 +161,7 @@ def save_figure(
     """
     from matplotlib import rc_context  # noqa: PLC0415 - loaded with the figure
 
-    text, suffix = as_json(provenance), texts.as_path(path).suffix
+    text, suffix = as_json(provenance), _text.as_path(path).suffix
     metadata: dict[str, dict[str, Any]] = {
         ".pdf": {"Creator": "dbthermal", "Subject": text, "CreationDate": None},
         ".svg": {"Creator": "dbthermal", "Description": text, "Date": None},
@@ -217,10 +214,8 @@ def save_video(
             if stream.width == 0:
                 stream.height, stream.width = height, width
             if (stream.height, stream.width) != (height, width) or height % 2 or width % 2:
-                raise ValueError(
-                    f"Invalid frame of {height} x {width} pixels. Must be of even size, "
-                    f"as all others: {stream.height} x {stream.width}."
-                )
+                rule = f"Must be of even size, as all others: {stream.height} x {stream.width}"
+                raise ValueError(f"Invalid frame of {height} x {width} pixels. {rule}.")
             film.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
         if stream.width == 0:
             raise ValueError("Invalid film without frames. Must have at least one.")

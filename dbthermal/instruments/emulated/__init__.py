@@ -4,11 +4,9 @@
 for byte where the protocol is public. All say that they are emulated. They were built from public
 descriptions; real devices may do more than these say.
 
-The wheel's emulator turns `World.wheel_position`, and the view of the camera behind it changes; the
-camera's emulator starts a flat-field correction, and its frames freeze; a program sets
-`World.blackbody_temperature`, and thermocouples and frames follow. There is no physics here.
-Temperatures are in kelvin, times in seconds on the world's clock; the scene has a time of its own,
-so that a recording can begin with it.
+Wheel, shutter, blackbody and thermocouples act on what the cameras see through the `World`; there
+is no physics here. Temperatures are in kelvin, times in seconds on the world's clock; the scene has
+a time of its own, so that a recording can begin with it.
 
 A picture is a function of the scene's time that gives the counts of a band, noise and response
 included. The camera adds a frame rate, a clock, buffers that overflow if no program reads, a
@@ -220,19 +218,15 @@ class EmulatedCamera(Closing):
             self._start = self.clock() + self._state.phase / self.frame_rate
         self._number = self.next_number(self._number, self.clock() - self._start)
         due = self._start + self._number / self.frame_rate
-        wait = due - self.clock()
+        wait, label = due - self.clock(), f"from emulated camera '{self.name}'"
         if wait > timeout:
             self.clock.sleep(timeout)
-            raise camera.NoFrameError(
-                f"No frame from emulated camera '{self.name}' in {timeout} s."
-            )
+            raise camera.NoFrameError(f"No frame {label} in {timeout} s.")
         if wait > 0:
             self.clock.sleep(wait)
         if not (self._open and self._state.plugged):
             state = "it is unplugged" if self._open else "it is closed"
-            raise camera.SourceLostError(
-                f"No more frames from emulated camera '{self.name}': {state}."
-            )
+            raise camera.SourceLostError(f"No more frames {label}: {state}.")
         number, self._number = self._number, self._number + 1
         return self.frame(number, due)
 
@@ -277,10 +271,8 @@ class EmulatedCamera(Closing):
             raise KeyError(f"Unknown band '{band}'. Must be one of {sorted(self.pictures)}.")
         image = self.pictures[band](self.world.scene_time(time))
         if image.shape != self.shape or image.dtype != np.uint16:
-            raise ValueError(
-                f"Invalid picture {image.shape} of {image.dtype} in band '{band}'. "
-                f"Must be {self.shape} of uint16."
-            )
+            label = f"Invalid picture {image.shape} of {image.dtype} in band '{band}'"
+            raise ValueError(f"{label}. Must be {self.shape} of uint16.")
         return image
 
 

@@ -10,10 +10,8 @@ reports of moves at any time. Its counter of commanded steps agrees with the whe
 once the home switch was found. Quirks are from issues 6, 14, 17, 74 and 83 of
 AlexShkarin/pyLabLib and the documentation of thorlabs_apt_device; the rest as in `_apt`.
 
-The TC-08 has the functions of the vendor's library, and none of its code: it writes into the
-caller's ctypes buffers. Signatures, error numbers and NaN for channels that are off are those of
-the header ``usbtc08.h``. The conversion time is from datalogd's documentation, and likely, not
-certain.
+The TC-08 has the functions of the vendor's library, by its header ``usbtc08.h``, and none of its
+code. The conversion time is from datalogd's documentation, and likely, not certain.
 """
 
 import math
@@ -26,9 +24,7 @@ from typing import Any, Final
 
 from scipy.constants import zero_Celsius
 
-from dbthermal.instruments import _apt as apt
-from dbthermal.instruments import _fslp as fslp
-from dbthermal.instruments import boson
+from dbthermal.instruments import _apt, _fslp, boson
 from dbthermal.instruments._apt import Id
 from dbthermal.instruments.camera import FfcMode, FfcStatus
 from dbthermal.instruments.emulated import ROOM, World
@@ -119,7 +115,7 @@ class EmulatedBoson(Line):
         # At power-on, by the identifier that sets them; not those of a real camera.
         self.settings = {setting.set_command: 0 for setting in boson.SETTINGS}
         self.settings[boson.FFC_MODE.set_command] = int(FfcMode.AUTO)
-        self._name, self._decoder = name, fslp.Decoder()
+        self._name, self._decoder = name, _fslp.Decoder()
 
     @property
     def plugged(self) -> bool:  # type: ignore[override]
@@ -129,14 +125,14 @@ class EmulatedBoson(Line):
     def receive(self, data: bytes) -> None:
         """Take in bytes; frames of channels that have no commands are ignored."""
         for frame in self._decoder.feed(data):
-            if frame.channel == fslp.COMMAND_CHANNEL:
+            if frame.channel == _fslp.COMMAND_CHANNEL:
                 self.request(frame)
 
-    def request(self, frame: fslp.Frame) -> None:
+    def request(self, frame: _fslp.Frame) -> None:
         """Take in one request, and answer at once."""
         self._replies.append(self.reply(frame))
 
-    def reply(self, request: fslp.Frame) -> bytes:
+    def reply(self, request: _fslp.Frame) -> bytes:
         """Bytes of the reply to a request, with status and data."""
         command, data, status, answer = request.command, request.data, 0, b""
         with self.world.lock:
@@ -145,7 +141,7 @@ class EmulatedBoson(Line):
             readings = self._readings()
             sizes = {boson.RUN_FFC: 0, **dict.fromkeys(self.settings, 4)}
             sizes |= dict.fromkeys(readings, 0)
-            if request.status != fslp.REQUEST or len(data) != sizes.get(command):
+            if request.status != _fslp.REQUEST or len(data) != sizes.get(command):
                 status = _REFUSED
             elif command == boson.RUN_FFC:
                 self.world.start_ffc(self._name)
@@ -153,7 +149,7 @@ class EmulatedBoson(Line):
                 (self.settings[command],) = struct.unpack(">i", data)
             else:
                 answer = readings[command]
-        return fslp.encode(request.sequence, command, answer, status)
+        return _fslp.encode(request.sequence, command, answer, status)
 
     def _readings(self) -> dict[int, bytes]:
         """Data of every reading and setting, by the identifier that reads it."""
@@ -215,8 +211,8 @@ class EmulatedApt(Line):
     [count].
     """
 
-    info = apt.Info(SERIAL_NUMBER, b"BSC201", notes=b"emulated, not hardware")
-    model, unit, address, slot_offset = BSC20X, apt.RACK, apt.BAY_1, 0.0
+    info = _apt.Info(SERIAL_NUMBER, b"BSC201", notes=b"emulated, not hardware")
+    model, unit, address, slot_offset = BSC20X, _apt.RACK, _apt.BAY_1, 0.0
 
     def __init__(self, world: World) -> None:
         super().__init__(world)
@@ -225,10 +221,10 @@ class EmulatedApt(Line):
         self.wheel = ((slot - 1) / 6 + self.slot_offset / 360.0) * self.model.turn
         self._drive: Drive | None = None
         self._kept: dict[int, Any] = {
-            Id.MOT_SET_VELPARAMS: apt.Speeds(1, 0, 0, 0),
-            Id.MOT_SET_HOMEPARAMS: apt.Home(1, 2, 1, 0, 0),
+            Id.MOT_SET_VELPARAMS: _apt.Speeds(1, 0, 0, 0),
+            Id.MOT_SET_HOMEPARAMS: _apt.Home(1, 2, 1, 0, 0),
         }
-        self._decoder = apt.Decoder(apt.CONTROLLERS, (apt.HOST,))
+        self._decoder = _apt.Decoder(_apt.CONTROLLERS, (_apt.HOST,))
 
     def receive(self, data: bytes) -> None:
         """Take in bytes from the driver."""
@@ -248,28 +244,28 @@ class EmulatedApt(Line):
             return super().next_due()
         return max(0.0, self._drive.start + self._drive.duration - self.world.clock())
 
-    def obey(self, message: apt.Message) -> None:
+    def obey(self, message: _apt.Message) -> None:
         """Carry out a message; an unknown one is ignored."""
         match message.id:
             case Id.HW_REQ_INFO:
-                self.reply(Id.HW_GET_INFO, apt.pack(self.info), source=message.destination)
+                self.reply(Id.HW_GET_INFO, _apt.pack(self.info), source=message.destination)
             case Id.MOD_SET_CHANENABLESTATE:
-                self.enabled = message.param2 == apt.YES
+                self.enabled = message.param2 == _apt.YES
             case Id.MOD_REQ_CHANENABLESTATE:
-                self.reply(Id.MOD_GET_CHANENABLESTATE, value=apt.YES if self.enabled else apt.NO)
+                self.reply(Id.MOD_GET_CHANENABLESTATE, value=_apt.YES if self.enabled else _apt.NO)
             case Id.MOT_SET_VELPARAMS | Id.MOT_SET_HOMEPARAMS:
-                self._kept[message.id] = apt.parse(type(self._kept[message.id]), message)
+                self._kept[message.id] = _apt.parse(type(self._kept[message.id]), message)
             case Id.MOT_REQ_VELPARAMS | Id.MOT_REQ_HOMEPARAMS:
-                self.reply(Id(message.id + 1), apt.pack(self._kept[message.id - 1]))
+                self.reply(Id(message.id + 1), _apt.pack(self._kept[message.id - 1]))
             case Id.MOT_REQ_STATUSUPDATE:
-                self.reply(Id.MOT_GET_STATUSUPDATE, apt.pack(self.status()))
+                self.reply(Id.MOT_GET_STATUSUPDATE, _apt.pack(self.status()))
             case Id.MOT_MOVE_HOME:
                 # Back to the home switch, or on to it, and further by the controller's own offset.
                 way, home = -(self.wheel % self.model.turn), self._kept[Id.MOT_SET_HOMEPARAMS]
                 way += self.model.turn if home.direction == 1 and way else 0
                 self.start(way + home.offset, home.velocity, homing=True)
             case Id.MOT_MOVE_ABSOLUTE if message.data:
-                target = apt.parse(apt.Position, message).position
+                target = _apt.parse(_apt.Position, message).position
                 velocity = self._kept[Id.MOT_SET_VELPARAMS].velocity
                 self.start(target - self.position, velocity)
             case Id.MOT_MOVE_STOP:  # at once, ramps are left out
@@ -298,10 +294,10 @@ class EmulatedApt(Line):
     def reply(self, identifier: Id, data: bytes = b"", value: int = 0, source: int = 0) -> None:
         """Send a message, of channel 1 without data; by default from the motor's address."""
         address, channel = source or self.address, 0 if data else 1
-        message = apt.Message(identifier, channel, value, apt.HOST, address, data)
-        self._replies.append(apt.encode(message))
+        message = _apt.Message(identifier, channel, value, _apt.HOST, address, data)
+        self._replies.append(_apt.encode(message))
 
-    def status(self) -> apt.Status:
+    def status(self) -> _apt.Status:
         """State of the motor, as the controller reports it."""
         bits, drive = StatusBits.CONNECTED, self._drive
         bits |= StatusBits.ENABLED if self.enabled else 0
@@ -309,7 +305,7 @@ class EmulatedApt(Line):
         if drive is not None:
             bits |= StatusBits.MOVING_FORWARD if drive.distance > 0 else StatusBits.MOVING_REVERSE
             bits |= StatusBits.HOMING if drive.homing else 0
-        return apt.Status(1, self.position, 0, bits)
+        return _apt.Status(1, self.position, 0, bits)
 
     def _advance(self) -> None:
         """Go on to now: move the motor, report the end of a motion, turn the world's wheel."""

@@ -39,7 +39,7 @@ __all__ = [
 ]
 __dir__ = __all__.copy
 
-Region = tuple[slice, slice]
+Place = tuple[slice, slice]
 Valid = npt.NDArray[np.bool_]
 
 # Attribute of a sweep, as of `calibration.fit_response`, by the key of the session's blackbody.
@@ -70,24 +70,8 @@ def open_capture(path: str | Path, *, fitted: bool = False) -> xr.Dataset:
         for a frame that is damaged, missing or not new; `frame_flags` (band, time), with bit
         ``shutter_closed``; `device_time`, `host_time`, `sequence`, and the camera's telemetry, if
         any. `time` is when the first band was exposed [s]. If fitted, attribute ``clock_rates`` has
-        b of each band.
-
-    Raises
-    ------
-    FileNotFoundError, ValueError
-        If the folder does not exist; if a band has fewer than two frames with a time, or a file is
-        not as it was written, see `dbthermal.store.open_dataset`.
-
-    Examples
-    --------
-    >>> from dbthermal.instruments import devices, protocols, recording, session
-    >>> camera = session.Camera("v4l2:///dev/video0")
-    >>> plan = session.Session("pot", True, "scene", 0.2, {"8-14": camera}, shape=(24, 32))
-    >>> path, limits = getfixture("tmp_path") / "pot.zarr", recording.Limits(reserve=0)
-    >>> with devices.open_devices(plan) as rig:
-    ...     summary = protocols.record_scene(rig, path, limits=limits)
-    >>> recording.open_capture(path)["counts"].dims
-    ('band', 'time', 'y', 'x')
+        b of each band. FileNotFoundError or ValueError if the folder does not exist, a band has
+        fewer than two frames with a time, or as `dbthermal.store.open_dataset`.
     """
     recording = store.open_dataset(path)
     opened = recording.drop_dims("log", errors="ignore").drop_vars("time", errors="ignore")
@@ -174,8 +158,7 @@ def overview(folder: str | Path) -> xr.Dataset:
 def _good(frames: xr.Dataset, bad: FrameFlag, stamp: str = "device_time") -> Valid:
     """True for the frames that have a stamp and none of the flags."""
     flags, stamps = frames["frame_flags"].values, frames[stamp].values
-    valid: Valid = np.isfinite(stamps) & ((flags & int(bad)) == 0)
-    return valid
+    return np.asarray(np.isfinite(stamps) & ((flags & int(bad)) == 0))
 
 
 def require_whole(folder: str | Path, *, share: float = _WHOLE) -> None:
@@ -213,13 +196,9 @@ def open_sweep(folder: str | Path, name: str, *, frames: int) -> xr.Dataset:
         with the band of the camera without filters from the recordings through the first filter.
         `temperature` is the mean of the blackbody's readings during the recordings of a step [K].
         Attributes as `calibration.fit_response` takes them, where the session states its accuracy.
-
-    Raises
-    ------
-    FileNotFoundError, ValueError
-        If there is no recording of such a session; if a recording is missing or incomplete, has
-        fewer good frames in a band, or no reading of the blackbody, or those of a step differ by
-        more than the session's stability.
+        FileNotFoundError or ValueError if there is no recording of such a session, or one is
+        missing or incomplete, has fewer good frames in a band, or no reading of the blackbody, or
+        those of a step differ by more than the session's stability.
     """
     steps, stability, shared = _sweep(folder, name)
     movies = [(_agreed(paths, BLACKBODY, stability), _movie(paths, frames)) for paths in steps]
@@ -233,10 +212,7 @@ def open_sweep(folder: str | Path, name: str, *, frames: int) -> xr.Dataset:
 
 
 def bench_series(
-    folder: str | Path,
-    name: str,
-    region: Mapping[str, Region],
-    correction: xr.Dataset | None = None,
+    folder: str | Path, name: str, region: Mapping[str, Place], correction: xr.Dataset | None = None
 ) -> dict[str, xr.Dataset]:
     """Mean counts and temperatures of an emissivity bench, a measurement for each step.
 
@@ -383,7 +359,7 @@ def _movie(paths: list[Path], frames: int) -> xr.DataArray:
     return xr.concat(films, dim="band")
 
 
-def _mean(capture: xr.Dataset, band: str, region: Region, correction: xr.Dataset | None) -> float:
+def _mean(capture: xr.Dataset, band: str, region: Place, correction: xr.Dataset | None) -> float:
     """Mean counts of a region in the good frames of a band."""
     place = {"y": region[0], "x": region[1]}
     good = _good_frames(capture, band)

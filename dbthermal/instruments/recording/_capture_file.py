@@ -11,6 +11,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from enum import IntEnum
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -91,7 +92,7 @@ _LAYOUT: Final = (
     )
 )
 
-_FRAMES, _LOG = ("band", "time"), ("log",)
+_FRAMES, _note = ("band", "time"), partial(Variable, ("log",))
 VARIABLES: Final = {
     "counts": STAGES["capture"]["counts"],
     "exposure_time": EXPOSURE_TIME,
@@ -99,14 +100,10 @@ VARIABLES: Final = {
     "host_time": Variable(_FRAMES, "float64", "s", "arrival at the host, since clock_origin"),
     "sequence": Variable(_FRAMES, "int64", "1", "number of the frame by its driver"),
     "frame_flags": replace(FRAME_FLAGS, more=_coded(FrameFlag)),
-    "log_time": Variable(_LOG, "float64", "s", "time of the note, since clock_origin"),
-    "log_kind": Variable(_LOG, "int16", "1", "kind of the note", _coded(Note)),
-    "log_source": Variable(
-        _LOG, "int16", "1", "source of the note: place in attribute log_sources"
-    ),
-    "log_value": Variable(
-        _LOG, "float64", "1", "value by kind of the note; see attribute log_units"
-    ),
+    "log_time": _note("float64", "s", "time of the note, since clock_origin"),
+    "log_kind": _note("int16", "1", "kind of the note", _coded(Note)),
+    "log_source": _note("int16", "1", "source of the note: place in attribute log_sources"),
+    "log_value": _note("float64", "1", "value by kind of the note; see attribute log_units"),
 }
 """Variables of every recording; `ABOUT` explains them together."""
 
@@ -164,22 +161,11 @@ class CaptureFile:
         self._notes: list[tuple[float, ...]] = []  # rows of the log that are not written yet
         self.broken = False
         # The store, explained by its attributes.
-        self.recording = store.Recording(
-            path,
-            self._variables,
-            self._sizes,
-            list(sources),
-            chunk=chunk,
-            attrs={
-                **attrs,
-                **self._start,
-                "comment": ABOUT,
-                "log_sources": self._names,
-                "log_units": dict(readings),
-                "log_kinds": {kind.name.lower(): int(kind) for kind in Note},
-            },
-            fills=_FILLS,
-        )
+        attrs = {**attrs, **self._start, "comment": ABOUT, "log_sources": self._names}
+        attrs["log_units"] = dict(readings)
+        attrs["log_kinds"] = {kind.name.lower(): int(kind) for kind in Note}
+        layout = path, self._variables, self._sizes, list(sources)
+        self.recording = store.Recording(*layout, chunk=chunk, attrs=attrs, fills=_FILLS)
         self._place = self.recording.place()
         self._bands = {band: _Band() for band in sources}
 

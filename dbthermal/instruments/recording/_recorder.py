@@ -57,10 +57,9 @@ class Limits:
 
     Attributes
     ----------
-    chunk, queue : int
-        Frames of a chunk, the most that a kill may cost, and of each band held until written.
-    reserve : int
-        Space that must stay free [byte].
+    chunk, queue, reserve : int
+        Frames of a chunk, the most that a kill may cost, and of each band held until written; space
+        that must stay free [byte].
     silence, reading_period, patience, preview_period : float
         Wait for a frame before it is noted that none came, time from reading to reading, wait at
         the end for a device that hangs, and least time from preview to preview [s].
@@ -81,10 +80,9 @@ class Preview:
 
     Attributes
     ----------
-    time : float
-        Time since the start [s].
-    frames, totals : mapping
-        By band, its last frame and its numbers of ``frames``, ``lost``, ``refused``, ``damaged``.
+    time, frames, totals : float, mapping, mapping
+        Time since the start [s]; by band, its last frame, and its numbers of ``frames``, ``lost``,
+        ``refused``, ``damaged``.
     readings, units : mapping
         Last value of each reading, NaN if it failed, and its unit, else kelvin.
     """
@@ -130,6 +128,12 @@ def record(
     after the start such a stamp counts as wrong. If the folder, or one above it, is renamed or
     moved on its disk, the recording goes on in it.
 
+    FileExistsError or ValueError if `path` exists, the sources are not those of the session, or are
+    emulated and it is not; OSError if there is too little space, or the folder or one in it was
+    deleted or replaced; else the error of a source, a reading or the preview, an interrupt by the
+    keyboard, or `SignalExit` by SIGTERM or SIGHUP in the main thread. What was recorded is kept in
+    all cases; a second interrupt ends the wait, not the writing.
+
     Parameters
     ----------
     session, sources : Session, mapping
@@ -141,17 +145,6 @@ def record(
     limits, preview : optional
         `Limits`; and a function called now and then with a `Preview` in the caller's thread, which
         may take its time.
-
-    Raises
-    ------
-    FileExistsError, ValueError
-        If `path` exists; or the sources are not those of the session, or emulated and it is not.
-    OSError
-        If there is too little space, or the folder or one in it was deleted or replaced.
-    Exception, SignalExit
-        Error of a source, a reading or the preview, an interrupt by the keyboard, or SIGTERM or
-        SIGHUP in the main thread. In all cases what was recorded is kept; a second interrupt ends
-        the wait, not the writing.
     """
     limits, clock = limits or Limits(), _check(session, sources)
     with raised_signals(), clock.joined():

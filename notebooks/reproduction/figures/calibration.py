@@ -11,6 +11,7 @@ from dbthermal import schema
 from dbthermal._coordinates import laid_on
 from dbthermal.figures import drawing
 from dbthermal.figures.drawing import COLORS, band_label, canvas, draw_image, limits_of
+from reproduction.figures.comparison import number_cells
 
 
 def gain_offset_maps(correction: xr.Dataset) -> Figure:
@@ -127,7 +128,7 @@ def condition_matrix(summary: xr.DataArray, materials: int) -> Figure:
     values = np.where(np.isfinite(summary.values), summary.values, np.nan)
     drawn = axis.imshow(values, cmap="viridis_r")
     middle = np.mean(limits_of(summary.copy(data=values)))
-    drawing.number_cells(axis, values, float(middle), "{:.0f}")
+    number_cells(axis, values, float(middle), "{:.0f}")
     for setter, dim in ((axis.set_xticks, "second"), (axis.set_yticks, "first")):
         setter(np.arange(summary.sizes[dim]), [band_label(name) for name in summary[dim].values])
     figure.colorbar(drawn, ax=axis, label="condition number [1]")

@@ -1,9 +1,10 @@
 """Figures that set methods, settings and bounds beside one another."""
 
 from collections.abc import Mapping, Sequence
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -66,7 +67,7 @@ def emissivity_errors(errors: xr.DataArray, *, title: str) -> Figure:
         image = errors.sel(variant=name).transpose("emissivity", "noise")[::-1]
         scale = (0.0, highest)
         draw_image(figure, axis, image, str(name), "error [1]", cmap="magma_r", limits=scale)
-        drawing.number_cells(axis, image.values, highest / 2, "{:.3f}", fontsize=7)
+        number_cells(axis, image.values, highest / 2, "{:.3f}", fontsize=7)
         axis.set_xticks(range(image.sizes["noise"]), [f"{v:g}" for v in image["noise"].values])
         rows = [f"{v:.2f}" for v in image["emissivity"].values]
         axis.set_yticks(range(image.sizes["emissivity"]), rows)
@@ -320,3 +321,13 @@ def pooled_materials(
         axis.set(xticks=[], yticks=[])
     figure.suptitle("Pixels of one material share their ratio" + drawing.provenance_note(single))
     return figure
+
+
+def number_cells(
+    axis: Axes, values: npt.NDArray[np.floating], middle: float, form: str, **style: Any
+) -> None:
+    """Write the finite values (row, column) of a map on it, white where they are above a middle."""
+    for row, column in np.argwhere(np.isfinite(values)):
+        color = "white" if values[row, column] > middle else "black"
+        text = form.format(values[row, column])
+        axis.text(column, row, text, ha="center", va="center", color=color, **style)
