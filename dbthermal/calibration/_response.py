@@ -69,12 +69,6 @@ def fit_response(  # noqa: PLR0913 - what is known of blackbody and cameras, by 
 
     .. math:: \sum_T r^2 > \left( s^2 + \tfrac{1}{12} + (a \, s_T)^2 \right) \chi^2_{n-2}
 
-    TypeError or ValueError if an input is not as described, a value is NaN, or the counts follow no
-    Planck curve, as of a camera that saturates, changes its range, or gives counts linear in
-    temperature; the error names the temperature. UserWarning if the NETD of a band of
-    `bands.FILTERS` is less than half that of one that contains it: then their names or files may be
-    exchanged.
-
     Parameters
     ----------
     counts : DataArray
@@ -108,6 +102,18 @@ def fit_response(  # noqa: PLR0913 - what is known of blackbody and cameras, by 
         `blackbody_emissivity`, `room_temperature` and `background_ratio_std` as stated. Attribute
         ``blackbody``, the temperatures and their deviations in words, which results repeat.
 
+    Raises
+    ------
+    TypeError, ValueError
+        If an input is not as described, a value is NaN, or the counts follow no Planck curve, as of
+        a camera that saturates, changes its range, or gives counts linear in temperature; the error
+        names the temperature.
+
+    Warns
+    -----
+    UserWarning
+        If the NETD of a band of `bands.FILTERS` is less than half that of one that contains it:
+        then their names or files may be exchanged.
 
     References
     ----------

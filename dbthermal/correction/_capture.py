@@ -31,6 +31,14 @@ def corrected_by_camera(capture: xr.Dataset) -> xr.Dataset:
     Dataset
         Stage `correction` for `correct_capture`: gain 1, offset 0 and no bad pixel (band, y, x);
         attribute ``by_camera`` = 1. TypeError or ValueError if there is no capture.
+
+    Examples
+    --------
+    >>> import numpy as np, xarray as xr
+    >>> counts = (("band", "time", "y", "x"), np.full((1, 2, 2, 2), 18000, np.uint16))
+    >>> capture = xr.Dataset({"counts": counts}, {"band": ["8-14"], "time": [0.0, 0.1]})
+    >>> correct(capture, corrected_by_camera(capture)).gain_offset_corrected
+    0
     """
     ones = xr.ones_like(schema.check(capture, "capture")["counts"][:, 0], dtype=np.float64)
     ones = ones.drop_vars("time", errors="ignore")
@@ -64,10 +72,6 @@ def correct_capture(  # noqa: PLR0913 - the options of each step, by name
     4. `undo_lag`, after 3, because a repeated frame says nothing of the pixel's past.
     5. `mark_bad`: pixels that are noisy, stuck or jump, in units of this capture's noise.
     6. `undo_drift` last, so that no bad pixel is part of the reference patch.
-
-    TypeError or ValueError if capture or correction is not of its stage, and as the steps;
-    UserWarning of bad frames, which it names, of frames that a stream repeats, and of a pattern
-    that changes or is not corrected.
 
     Parameters
     ----------
@@ -105,6 +109,16 @@ def correct_capture(  # noqa: PLR0913 - the options of each step, by name
         show no scene), and ``shutter_closed_frames`` (by band, recorded as closed; -1 without
         `frame_flags`).
 
+    Raises
+    ------
+    TypeError, ValueError
+        If capture or correction is not of its stage, and as the steps.
+
+    Warns
+    -----
+    UserWarning
+        Of bad frames, which it names, of frames that a stream repeats, and of a pattern that
+        changes or is not corrected.
 
     Examples
     --------

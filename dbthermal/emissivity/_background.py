@@ -74,7 +74,7 @@ def background_ratio(result: xr.Dataset, mask: xr.DataArray) -> xr.Dataset:
     r"""Ratio of what is mirrored in each band to that in the reference band, seen in foil.
 
     Crumpled aluminium foil reflects all bands alike, from everywhere: its reflection ratio is g.
-    TypeError or ValueError if the mask is not as described, or no pixel of it has such a ratio.
+
 
     Parameters
     ----------
@@ -88,6 +88,11 @@ def background_ratio(result: xr.Dataset, mask: xr.DataArray) -> xr.Dataset:
     Dataset
         `background_ratio` (band) [1], mean over the pixels, and `background_ratio_std`, deviation
         of one pixel and 1 % of the foil itself. For `separation.separate`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the mask is not as described, or no pixel of it has a reflection ratio.
 
 
     Examples

@@ -45,9 +45,8 @@ def explore(
 
     Slider, arrow keys or space change the time; wheel and drag zoom all pictures; rectangle,
     ellipse and polygon make regions, whose mean, least and greatest values are drawn with the
-    standard deviation of the mean (`View.curve`). Flagged pixels are hatched. The notebook shows
-    the explorer as the last value of a cell; without a browser, as in papermill or HTML, a picture
-    takes the place. TypeError or ValueError as `View`.
+    standard deviation of the mean (`View.curve`). Flagged pixels are hatched. Without a browser, as
+    in papermill or HTML, a picture takes the place.
 
     nbconvert prefers a widget's saved state, which shows nothing without a kernel, to that picture,
     unless ``--NbConvertBase.display_data_priority="['image/png', 'text/html', 'text/plain']"``.
@@ -64,5 +63,19 @@ def explore(
     events, celsius : mapping of str to float, bool
         Name to time [s] of what is marked on the time axis, beside the flags of the capture; True
         for degrees Celsius instead of kelvin, for which the explorer has a button.
+
+    Returns
+    -------
+    Explorer
+        Shown by the notebook as the last value of a cell. TypeError or ValueError as `View`.
+
+    Examples
+    --------
+    >>> import numpy as np, xarray as xr, dbthermal
+    >>> dims = ("time", "y", "x")
+    >>> film = xr.DataArray(np.full((3, 4, 6), 300.0), {"time": [0.0, 0.1, 0.2]}, dims)
+    >>> explorer = dbthermal.explore(film.to_dataset(name="object_temperature"))
+    >>> list(explorer.view.panes)
+    ['object_temperature']
     """
     return __getattr__("Explorer")(View(data, capture, response, events=events), celsius=celsius)

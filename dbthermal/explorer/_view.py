@@ -42,10 +42,6 @@ class View:
     Films that are not in memory are copied into a temporary file (``TMPDIR``) when they are first
     read: 4 bytes a pixel and frame on disk, and in memory a row of a store's chunks.
 
-    TypeError if the data are neither a Dataset nor a path; ValueError if there is no temperature
-    and no counts, a variable is not as `schema` says, the capture has other frames, pixels or
-    bands, or an event is not at a finite time.
-
     Parameters
     ----------
     data : Dataset, str or Path
@@ -64,6 +60,13 @@ class View:
         Time of each frame [s]; rows and columns.
     events : dict of str to float
         Name to time [s], with what segments and frame flags of the capture say.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the data are neither a Dataset nor a path; if there is no temperature and no counts, a
+        variable is not as `schema` says, the capture has other frames, pixels or bands, or an event
+        is not at a finite time.
 
     Examples
     --------
@@ -182,10 +185,6 @@ class View:
         .. math:: s^2 = \left(\frac1n \sum_i k_i\right)^2 + \left(\frac1n \sum_i c_i\right)^2
                   + \frac1{n^2} \sum_i (s_i^2 - k_i^2 - c_i^2)
 
-        The deviations exclude the correlation of neighbours by interpolation. That of the reflected
-        temperature is mostly the prior of its drift (`SubspaceSettings.background_drift`): without
-        a drift the mean is much closer.
-
         Parameters
         ----------
         name, region : str, Region
@@ -199,6 +198,12 @@ class View:
             `mean`, `minimum`, `maximum`, `std` in the pane's units, its part `calibration_std`, and
             `pixels`, the number that counts, over (time); without it for a map. NaN where no pixel
             counts. `std` is NaN where the result states no deviation.
+
+        Notes
+        -----
+        The deviations exclude the correlation of neighbours by interpolation. That of the reflected
+        temperature is mostly the prior of its drift (`SubspaceSettings.background_drift`): without
+        a drift the mean is much closer.
         """
         pane, mask = self.pane(name), region.mask(self.shape)
         if pane.kind == "status":

@@ -157,6 +157,15 @@ class Boson(Closing):
     Each method raises `BosonTimeoutError` if no reply comes, `BosonError` if a wrong one does or
     the camera refuses, and `TransportError` if it is gone. A reading is requested again if no reply
     comes; a command that changes the camera never is.
+
+    Examples
+    --------
+    >>> from dbthermal.instruments.emulated import World, devices
+    >>> bench = World()
+    >>> state = bench.add_camera("8-14", 93588)
+    >>> with Boson(devices.EmulatedBoson(bench, "8-14")) as port:
+    ...     port.fpa_temperature(), port.identity()["is_simulated"]  # K
+    (308.15, True)
     """
 
     def __init__(self, transport: Transport, *, first_sequence: int | None = None) -> None:

@@ -219,6 +219,12 @@ class View:
     bands of 640 x 512 takes a fifth of a second of one core. `title` is the recording's name. With
     a `separation` it shows temperatures as well. `figure` is the last one that was drawn, None
     before the first preview.
+
+    Examples
+    --------
+    >>> view = View(is_simulated=True, title="pot")
+    >>> view.status
+    {}
     """
 
     def __init__(

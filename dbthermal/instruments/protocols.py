@@ -98,13 +98,7 @@ def record_sweep(
     The cameras' offsets are corrected at each temperature, for they drift in the hours of a sweep.
     Complete recordings of this sweep that are in the folder are kept, so that an interrupted sweep
     goes on where it was. If the folder is renamed or moved meanwhile the sweep goes on in it. Call
-    `Devices.prepare` before. Returns the summaries in the order of the session, by temperature,
-    then filter, with those that were kept.
-
-    ValueError if the session has no blackbody, or no reading of it, or if a recording exists that
-    is incomplete, of another temperature, or during which the wheel turned. TimeoutError,
-    SourceLostError or FileNotFoundError as `wait_stable`, or if a camera is lost or the folder
-    deleted: what was recorded is kept.
+    `Devices.prepare` before.
 
     Parameters
     ----------
@@ -117,6 +111,18 @@ def record_sweep(
         As for `dbthermal.instruments.recording.record`. The camera behind the wheel has the name of
         the filter in the beam.
 
+    Returns
+    -------
+    list of Summary
+        In the order of the session, by temperature, then filter, with those that were kept.
+
+    Raises
+    ------
+    ValueError
+        If the session has no blackbody, or no reading of it; or a recording exists that is
+        incomplete, of another temperature, or during which the wheel turned.
+    TimeoutError, SourceLostError, FileNotFoundError
+        As `wait_stable`; or a camera is lost, or the folder deleted. What was recorded is kept.
     """
     session = devices.session
     readings = devices.readings()

@@ -123,6 +123,17 @@ class TC08(Closing):
     """A TC-08, opened by `from_url` or `open`; several threads may `read`.
 
     The `library` is from `load`, or an emulated one.
+
+    Examples
+    --------
+    >>> from dbthermal.instruments.emulated import World, devices
+    >>> bench = World(blackbody_temperature=310.0)
+    >>> bench.thermocouples[1] = "blackbody"
+    >>> unit = devices.EmulatedTC08(bench.thermocouple_temperature, bench.clock)
+    >>> with TC08(unit).open() as logger:
+    ...     logger.set_channels({1: "blackbody"})
+    ...     print(f"{logger.read(1):.2f} K")
+    310.00 K
     """
 
     def __init__(self, library: Library) -> None:

@@ -35,16 +35,6 @@ def bounds(
     polynomials of time; y, one number a frame, eliminated by variable projection [2]_, and in the
     frames at rest one number for all. Response and noise are known.
 
-    For the linear response and two bands, ``resting=False`` gives the reflection ratio its closed
-    form, and no emissivity: scaling :math:`1 - e_m` up and :math:`y - x` down
-    alike changes no sample. Frames at rest determine the emissivities, and sharpen the ratio; the
-    curvature of the exact response determines them without, but hardly, and the bound of the ratio
-    is then loose. An `emissivity_std` of 0.29, that of a uniform number in (0, 1), tightens it.
-
-    TypeError or ValueError if an input is not as described, there is one band only, an emissivity
-    lies outside (0, 1), a temperature outside the response's range, or no smooth subspace holds the
-    object.
-
     Parameters
     ----------
     scene : Dataset
@@ -74,6 +64,20 @@ def bounds(
         bands, is below that of a uniform number in (0, 1) or in the calibrated range, and for a
         ratio below the ratio itself. `condition_number`, `order` (y, x) [1]; `resting`
         (time, y, x).
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an input is not as described, there is one band only, an emissivity lies outside (0, 1),
+        a temperature outside the response's range, or no smooth subspace holds the object.
+
+    Notes
+    -----
+    For the linear response and two bands, ``resting=False`` gives the reflection ratio its closed
+    form, and no emissivity: scaling :math:`1 - e_m` up and :math:`y - x` down alike changes no
+    sample. Frames at rest determine the emissivities, and sharpen the ratio; the curvature of the
+    exact response determines them without, but hardly, and the bound of the ratio is then loose. An
+    `emissivity_std` of 0.29, that of a uniform number in (0, 1), tightens it.
 
     References
     ----------

@@ -82,10 +82,6 @@ def plan(
     The Cramer-Rao bound of `bounds` for a designed capture, with Planck's law over each band. The
     emissivity errors of n pixels of one material fall as :math:`1 / \sqrt{n}`.
 
-    KeyError, TypeError or ValueError if table or noise are not as `schema` has them, a band is
-    unknown, an emissivity lies outside (0, 1), or the band `beside` or as many others as used
-    together are missing.
-
     Parameters
     ----------
     table, noise : Dataset, DataArray
@@ -113,6 +109,12 @@ def plan(
         Outdoors also `sky_error` (material, filter) [K], of an object before a sky that is taken
         for gray, :math:`|x - y| \sum_m w_m (1 - e_m) (g_m / g_1 - 1)` with the weights w of the
         bands in the object; the best filter has the smallest root of both squares.
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError
+        If table or noise are not as `schema` has them, a band is unknown, an emissivity lies
+        outside (0, 1), or the band `beside` or as many others as used together are missing.
 
     Examples
     --------
@@ -176,14 +178,17 @@ def plan_durations(
 ) -> xr.Dataset:
     """Expected accuracy of captures of several lengths, of one filter at a time.
 
-    As from `plan`, with `seconds` [s] as the first dimension; `noise` is the same in all.
-
     Parameters
     ----------
     table, noise
         See `plan`.
     seconds, design : sequence of float, CaptureDesign
         Lengths [s], which must increase; all other conditions, the same for all lengths.
+
+    Returns
+    -------
+    Dataset
+        As from `plan`, with `seconds` [s] as the first dimension; `noise` is the same in all.
 
     Examples
     --------

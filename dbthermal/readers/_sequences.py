@@ -110,9 +110,7 @@ def _are_longer(counts: Counts) -> bool:
 
 
 def sequence(path: str | Path, *, clock: Clock | None = None, memory: float = MEMORY) -> xr.Dataset:
-    """Counts of a recording in an .sfmov of FLIR or an .hcc of Telops, as from `tiff`.
-
-    FileNotFoundError or ValueError as `array`, and if the numbers are temperatures or radiances.
+    """Counts of a recording in an .sfmov of FLIR or an .hcc of Telops.
 
     Parameters
     ----------
@@ -120,6 +118,16 @@ def sequence(path: str | Path, *, clock: Clock | None = None, memory: float = ME
         File; the .inc of an .sfmov lies beside it.
     clock, memory
         As for `array`.
+
+    Returns
+    -------
+    Dataset
+        As from `tiff`.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        As `array`, and if the numbers are temperatures or radiances.
     """
     _recording.check_number(memory, "memory")
     (path,) = _formats.files([path], "sequence")

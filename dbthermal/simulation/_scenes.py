@@ -194,7 +194,7 @@ def walkers(
     crossings: int = 7,
     time_constant: float = 12.0,
 ) -> xr.Dataset:
-    """Plate, heated in its middle, that reflects people who walk by: its `scene`.
+    """Plate, heated in its middle, that reflects people who walk by.
 
     Each person is an upright ellipse with a head, warmer than the room, that crosses the view once
     at a steady pace.
@@ -210,6 +210,11 @@ def walkers(
     temperatures, time_constant : sequence of float, float
         Temperatures of the room, of people, and of the plate's middle at the end [K]; time constant
         of the heating [s].
+
+    Returns
+    -------
+    Dataset
+        The scene, see `scene`.
 
     Examples
     --------

@@ -238,11 +238,6 @@ def open_dataset(path: str | Path) -> xr.Dataset:
     A recording that was cut short, or is being written, opens as far as all bands are valid; its
     attributes have ``complete`` = False and, in ``frames_written``, the end of each band.
 
-    FileNotFoundError if the folder does not exist; ValueError, with file, array and store, if a
-    file of it, or of the valid part of a recording that was cut short, is not as it was written,
-    missing, or foreign; of a chunk, when it is read. UserWarning if the store has no checksums, as
-    of dbthermal 0.1.0, so that damage cannot be seen.
-
     Parameters
     ----------
     path : str or Path
@@ -251,8 +246,33 @@ def open_dataset(path: str | Path) -> xr.Dataset:
     Returns
     -------
     Dataset
-        Identical to the one saved, with ``attrs["provenance"]`` added; see the example of `save`.
-        Text is of NumPy's fixed-length kind.
+        Identical to the one saved, with ``attrs["provenance"]`` added. Text is of NumPy's
+        fixed-length kind.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the folder does not exist.
+    ValueError
+        With file, array and store, if a file of it, or of the valid part of a recording that was
+        cut short, is not as it was written, missing, or foreign; of a chunk, when it is read.
+
+    Warns
+    -----
+    UserWarning
+        If the store has no checksums, as of dbthermal 0.1.0, so that damage cannot be seen.
+
+    Examples
+    --------
+    >>> import xarray as xr
+    >>> from tempfile import TemporaryDirectory
+    >>> from dbthermal import store
+    >>> wall = xr.Dataset({"object_temperature": ("time", [295.2, 295.3], {"units": "K"})})
+    >>> with TemporaryDirectory() as folder:
+    ...     store.save(wall, f"{folder}/wall.zarr", store.provenance({"frames": 2}))
+    ...     saved = store.open_dataset(f"{folder}/wall.zarr").load()
+    >>> saved.equals(wall), saved.attrs["provenance"]["parameters"]
+    (True, {'frames': 2})
     """
     if not texts.as_path(path).is_dir():
         rule = "Must be a zarr folder, as `save`, a notebook or a command leaves it"

@@ -70,8 +70,24 @@ def open_capture(path: str | Path, *, fitted: bool = False) -> xr.Dataset:
         for a frame that is damaged, missing or not new; `frame_flags` (band, time), with bit
         ``shutter_closed``; `device_time`, `host_time`, `sequence`, and the camera's telemetry, if
         any. `time` is when the first band was exposed [s]. If fitted, attribute ``clock_rates`` has
-        b of each band. FileNotFoundError or ValueError if the folder does not exist, a band has
-        fewer than two frames with a time, or as `dbthermal.store.open_dataset`.
+        b of each band.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        If the folder does not exist, a band has fewer than two frames with a time, or as
+        `dbthermal.store.open_dataset`.
+
+    Examples
+    --------
+    >>> from dbthermal.instruments import devices, protocols, recording, session
+    >>> camera = session.Camera("v4l2:///dev/video0")
+    >>> plan = session.Session("pot", True, "scene", 0.2, {"8-14": camera}, shape=(24, 32))
+    >>> path, limits = getfixture("tmp_path") / "pot.zarr", recording.Limits(reserve=0)
+    >>> with devices.open_devices(plan) as rig:
+    ...     summary = protocols.record_scene(rig, path, limits=limits)
+    >>> recording.open_capture(path)["counts"].dims
+    ('band', 'time', 'y', 'x')
     """
     recording = store.open_dataset(path)
     opened = recording.drop_dims("log", errors="ignore").drop_vars("time", errors="ignore")
@@ -196,9 +212,13 @@ def open_sweep(folder: str | Path, name: str, *, frames: int) -> xr.Dataset:
         with the band of the camera without filters from the recordings through the first filter.
         `temperature` is the mean of the blackbody's readings during the recordings of a step [K].
         Attributes as `calibration.fit_response` takes them, where the session states its accuracy.
-        FileNotFoundError or ValueError if there is no recording of such a session, or one is
-        missing or incomplete, has fewer good frames in a band, or no reading of the blackbody, or
-        those of a step differ by more than the session's stability.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        If there is no recording of such a session, or one is missing or incomplete, has fewer good
+        frames in a band, or no reading of the blackbody, or those of a step differ by more than the
+        session's stability.
     """
     steps, stability, shared = _sweep(folder, name)
     movies = [(_agreed(paths, BLACKBODY, stability), _movie(paths, frames)) for paths in steps]

@@ -128,12 +128,6 @@ def record(
     after the start such a stamp counts as wrong. If the folder, or one above it, is renamed or
     moved on its disk, the recording goes on in it.
 
-    FileExistsError or ValueError if `path` exists, the sources are not those of the session, or are
-    emulated and it is not; OSError if there is too little space, or the folder or one in it was
-    deleted or replaced; else the error of a source, a reading or the preview, an interrupt by the
-    keyboard, or `SignalExit` by SIGTERM or SIGHUP in the main thread. What was recorded is kept in
-    all cases; a second interrupt ends the wait, not the writing.
-
     Parameters
     ----------
     session, sources : Session, mapping
@@ -145,6 +139,17 @@ def record(
     limits, preview : optional
         `Limits`; and a function called now and then with a `Preview` in the caller's thread, which
         may take its time.
+
+    Raises
+    ------
+    FileExistsError, ValueError
+        If `path` exists; or the sources are not those of the session, or emulated and it is not.
+    OSError
+        If there is too little space, or the folder or one in it was deleted or replaced.
+    Exception, SignalExit
+        Error of a source, a reading or the preview, an interrupt by the keyboard, or SIGTERM or
+        SIGHUP in the main thread. In all cases what was recorded is kept; a second interrupt ends
+        the wait, not the writing.
     """
     limits, clock = limits or Limits(), _check(session, sources)
     with raised_signals(), clock.joined():
