@@ -26,6 +26,7 @@ from dbthermal.noise import MINIMUM_FRAMES
 _QUIET: Final = 0.8  # smallest share of a pixel's changes, that are noise
 # Mean magnitude of that share of a standard normal distribution.
 _QUIET_MEAN: Final = 2.0 * (1.0 - np.exp(-0.5 * ndtri(0.9) ** 2)) / np.sqrt(2.0 * np.pi) / _QUIET
+_GAP: Final = 1.5  # deviation of the weights that fill a gap [pixel]
 PIXELS: Final = 16  # pixels, about, from which noise and step of the counts are estimated
 # Width of the mean over pixels of the noise of resampled counts, and steps in time.
 _AROUND, _STEPS = 5, 700
@@ -324,3 +325,10 @@ def neighbour_mean(
     ]
     empty = np.full(sums[0].shape, np.nan)
     return np.asarray(np.divide(sums[0], sums[1], out=empty, where=sums[1] > 0))
+
+
+def without_gaps(image: npt.NDArray[Any], valid: Mask) -> npt.NDArray[Any]:
+    """Image (y, x) whose pixels that are not valid are the mean around; zero without any."""
+    if valid.all():
+        return image
+    return np.where(valid, image, np.nan_to_num(neighbour_mean(image, valid * 1.0, _GAP)))

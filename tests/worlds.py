@@ -35,6 +35,7 @@ class World:
     blur: Pair = (0.0, 0.0)  # of the lenses [pixel]
     roughness: Pair = (0.0, 0.0)  # blur of what is mirrored [pixel]
     shake: Pair = (0.0, 0.0)  # of the cameras, correlated over 0.15 s [pixel]
+    off: float = 0.0  # columns by which the second image lies beside the first [pixel]
     turn: float = 0.0  # of the cameras together about their axis, as they shake [degree]
     sway: float = 0.0  # of their distance, as a share of it [1]
     drift: Pair = (0.0, 0.0)  # of the cameras' pointing along the rows, over the capture [pixel]
@@ -131,6 +132,7 @@ def seen(world: World, seed: int) -> tuple[xr.Dataset, Array]:
     motion = paths(rng, world.shake)
     held = [np.deg2rad(world.turn), world.sway] * paths(np.random.default_rng([seed, 2]), (1, 1))[0]
     motion[..., 1] += np.outer(world.drift, time / time[-1] - 0.5)
+    motion[1, :, 1] += world.off
     times = np.stack([time, (time + world.lag) * (1.0 + world.fast)])
     if world.jitter:
         times = times + world.jitter * np.random.default_rng([seed, 1]).standard_normal(times.shape)

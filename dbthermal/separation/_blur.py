@@ -9,7 +9,7 @@ pixels. The band that is sharper is blurred, and c is sought again until nothing
 """
 
 from dataclasses import dataclass
-from typing import Any, Final, TypeAlias
+from typing import Final, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +23,8 @@ from scipy.ndimage import (
 )
 
 from dbthermal import _smooth as smooth
-from dbthermal._arrays import Array, Mask, empty, quotient, release
+from dbthermal._arrays import Array, empty, quotient, release
+from dbthermal._samples import without_gaps
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._misfit import (
     Misfit,
@@ -42,7 +43,6 @@ _BORDER, _ALIKE, _MOSTLY = 7, 1.05, 0.2
 # Blur of both bands [pixel^2], against noise: it leaves their difference as it is.
 _COMMON: Final = 2.0
 _BROAD: Final = 5.0  # deviation of the blur that tells what is broad [pixel]
-_GAP: Final = 1.5  # deviation of the weights that fill a gap [pixel]
 _FEWEST: Final = 16  # rows and columns of an image, whose edges are left out, at least
 _EDGE: Final = 6  # pixels at the image's edge that are left out
 _MOVING: Final = 1.0  # variance of the changes over that of noise
@@ -124,7 +124,7 @@ def _blur_rapid(film: npt.NDArray[np.float32], inputs: Inputs, deviation: float)
     Returns the root mean square (y, x) over time of what a blur makes of all else, and of the
     rapid changes that it would take from outside the image.
     """
-    valid = np.isfinite(film) & good_pixels(inputs)
+    valid = np.isfinite(film) & inputs.good
     filled = np.stack([without_gaps(*pair) for pair in zip(film, valid, strict=True)])
     functions = smooth_functions(inputs, np.ones(len(film), dtype=bool)).astype(np.float32)
     maps = np.tensordot(functions.T, filled, 1)
@@ -136,22 +136,6 @@ def _blur_rapid(film: npt.NDArray[np.float32], inputs: Inputs, deviation: float)
         square += (outside * (blurred - np.tensordot(coefficients, maps, 1))) ** 2
         frame[used] = blurred[used]
     return np.asarray(np.sqrt(square / len(film)))
-
-
-def good_pixels(inputs: Inputs) -> Mask:
-    """Pixels (y, x) of a capture without a flag."""
-    if "status" not in inputs.capture:
-        return np.ones((inputs.capture.sizes["y"], inputs.capture.sizes["x"]), dtype=bool)
-    return np.asarray(inputs.capture["status"].values == 0)
-
-
-def without_gaps(image: npt.NDArray[Any], valid: Mask) -> npt.NDArray[Any]:
-    """An image whose pixels that are not valid are those around, weighted; zero without any."""
-    if valid.all():
-        return image
-    weight = gaussian_filter(valid.astype(np.float64), _GAP)
-    local = gaussian_filter(np.where(valid, image, 0.0), _GAP)
-    return np.where(valid, image, quotient(local, weight, 0.0))
 
 
 def _blurred(image: npt.NDArray[np.floating], deviation: float) -> Array:

@@ -13,7 +13,7 @@ from dbthermal import _samples as samples
 from dbthermal import noise as noises
 from dbthermal import planck, schema
 from dbthermal import response as responses
-from dbthermal._arrays import Array
+from dbthermal._arrays import Array, Mask, stride
 from dbthermal._coordinates import laid_on
 from dbthermal._warnings import warned
 from dbthermal.response import Curve
@@ -35,6 +35,7 @@ _NOISE_SAMPLES: Final = 2**19  # of a band, at most: fewer prove no noise 1.4 ti
 # Mean steps, by which a time may be off an even clock, unlooked at.
 _NEARLY_EVEN: Final = 1.0
 _READ: Final = ("counts", "status", "segment", "noise_factor", "pattern_std")
+_SEEN: Final = 4096  # pixels, about, by which a frame is seen to be measured
 _ROUNDED: Final = 1e-6  # negative eigenvalue of a covariance that is rounding [1]
 
 
@@ -99,6 +100,20 @@ class Inputs:
     displacement: Displacement | None  # of the second camera's reflections
     division: npt.NDArray[np.uint8]  # of the time, by the pass before, packed (frame / 8, pixel)
     difference: Callable[[slice, slice | Labels], npt.NDArray[Any]] | None = None  # `joint.Joint`
+
+    @property
+    def good(self) -> Mask:
+        """Pixels (y, x) of the capture without a flag."""
+        if "status" in self.capture:
+            return np.asarray(self.capture["status"].values == 0)
+        return np.ones((self.capture.sizes["y"], self.capture.sizes["x"]), dtype=bool)
+
+    @property
+    def frames(self) -> Mask:
+        """Frames (time) that every band has, seen by some pixels."""
+        step = stride(self.capture["counts"].shape[2:], _SEEN)
+        measured = schema.measured(self.capture["counts"][:, :, ::step, ::step].values)
+        return np.asarray(measured.any(axis=(2, 3)).all(axis=0))
 
     @property
     def blocks(self) -> list[slice]:

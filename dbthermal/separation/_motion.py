@@ -22,24 +22,35 @@ from typing import Final, NamedTuple
 
 import numpy as np
 import xarray as xr
-from scipy.ndimage import binary_erosion, map_coordinates
+from scipy.ndimage import binary_erosion
 
 from dbthermal import _smooth as smooth
-from dbthermal._arrays import Array, Mask, empty, quotient, release
+from dbthermal._arrays import Array, Mask, quotient
+from dbthermal._samples import without_gaps
 from dbthermal.schema import Status
-from dbthermal.separation._blur import good_pixels, without_gaps
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._misfit import Misfit, Reading, Whole, smooth_functions
+from dbthermal.separation._overlay import (
+    PARAMETERS,
+    SURE,
+    Moved,
+    along,
+    gradients,
+    jackknife,
+    moved,
+    places_of,
+    resampled,
+    size_of,
+    solved,
+    sources_of,
+)
 from dbthermal.separation._subspace.reflection_ratio import HIGHEST_ORDER
 
-# Parameters of a motion [pixel]: down and right; and a turn and a growth, as they displace what is
-# at the rms distance from the middle, so that the mean square along an axis is half their squares.
-_PARAMETERS: Final = 4
 # Prior deviations [pixel] of rapid motion that the bands share, or do not; and of slow motion.
 _COMMON, _APART, _TURN = 3.0, 0.1, 1.0
-# Square of a motion over its variance by a jackknife of windows, from which it is undone. Slow: see
-# below. Rapid motion, median over the frames: at most 2 without any, 9 to 28 of 0.3 pixel.
-_SURE, _SHAKEN = 20.0, 5.0
+# Square of rapid motion over its variance by a jackknife of windows, median over the frames, from
+# which it is undone: at most 2 without any, 9 to 28 of 0.3 pixel.
+_SHAKEN: Final = 5.0
 _SLOW: Final = 3  # smooth functions in which the image's gradients change
 _LEAST: Final = 0.1  # motion of a band that matters, rms [pixel]: two depths feign 0.06
 # Of rapid motion: side of a window, least and most, and what is read around it [pixel]; samples of
@@ -55,77 +66,23 @@ _HALF: Final = 4.0
 _DISTURBED: Final = Status.OBJECT_NOT_SMOOTH | Status.OBJECT_JUMP | Status.BANDS_APART
 _MANY: Final = 0.1
 # Of slow motion: polynomials of the time, windows along a side of the image, and frames at most. By
-# the square above a drift of one pixel shows 78 or more, a filter wheel 10, 31 plain scenes at most
+# that square a drift of one pixel shows 78 or more, a filter wheel 10, 31 plain scenes at most
 # 9; 30 of 24x32 pixels, with half the windows, up to 93, but of less than 0.06 pixel.
 _DEGREES, _WINDOWS, _FRAMES = 6, 4, 128
 
 
 @dataclass(frozen=True)
-class Stabilised:
+class Stabilised(Moved):
     """A capture whose frames lie on one another."""
-
-    capture: xr.Dataset
-    motion: Array  # of each band's image (band, time, parameter) [pixel]
-    slow: Array  # expected motion that is left (parameter) [pixel]
 
     def sentence(self, *, undone: bool) -> str:
         """Sentence on how far the image of each band moved."""
         sizes = ", ".join(
-            f"'{band}' {_size(path):.2f}"
+            f"'{band}' {size_of(path):.2f}"
             for band, path in zip(self.capture["band"].values, self.motion, strict=True)
         )
         outcome = "was undone" if undone else "could not be undone: intervals may be too small"
         return f"The image moved, by {sizes} pixel (rms), which {outcome}."
-
-    def detail(self, inputs: Inputs, result: xr.Dataset) -> Array:
-        """Deviation (y, x) [K] of the object's signal by the motion that is left."""
-        curve, film = inputs.curves[inputs.bands[0]], result["object_temperature"].values
-        sound = np.isfinite(film).any(axis=0)
-        mean = np.full(sound.shape, np.nan)
-        mean[sound] = curve.signal(np.nanmean(film[:, sound], axis=0, dtype=np.float64))
-        slopes = _along(_gradients(without_gaps(np.nan_to_num(mean), sound)), _places(mean.shape))
-        return np.asarray(np.sqrt(np.einsum("ayx,a->yx", slopes**2, self.slow**2)))
-
-
-def _size(path: Array) -> float:
-    """Root mean square along an axis [pixel], over the image, of a motion (time, parameter)."""
-    return float(np.sqrt(np.mean(np.sum(path**2, axis=-1)) / 2.0))
-
-
-def _places(shape: tuple[int, ...]) -> Array:
-    """Places (axis, y, x) from the image's middle, over their rms distance from it."""
-    middle = 0.5 * (np.reshape(shape, (2, 1, 1)) - 1.0)
-    places = np.indices(shape) - middle
-    return np.asarray(places / np.sqrt(np.mean(np.sum(places**2, axis=0)) or 1.0))
-
-
-def _along(slopes: Array, places: Array) -> Array:
-    """Changes (parameter, ..., pixel) by a motion, of slopes (axis, ..., pixel) at places."""
-    (down, right), (y, x) = slopes, places
-    return np.stack([down, right, down * x - right * y, down * y + right * x])
-
-
-def _sources(step: Array, places: Array) -> Array:
-    """Where (axis, y, x) [pixel] in an image that moved by a step (parameter) its pixels went from.
-
-    Those of the window of the places, in it.
-    """
-    down, right, turn, growth = step
-    y, x = places
-    moved = np.stack([down + turn * x + growth * y, right - turn * y + growth * x])
-    return np.asarray(np.indices(y.shape) - moved)
-
-
-def _resampled(image: Array, sources: Array) -> Array:
-    """Image at places (axis, y, x) [pixel], between its pixels by cubic splines."""
-    return np.asarray(map_coordinates(image, sources, order=3, mode="nearest"))
-
-
-def _gradients(images: Array) -> Array:
-    """Gradients (axis, ..., y, x) [1 / pixel] of images; zero across a single row or column."""
-    axes = images.ndim - 2, images.ndim - 1
-    sides = [np.gradient(images, axis=it) if images.shape[it] > 1 else 0.0 * images for it in axes]
-    return np.stack(sides)
 
 
 def stabilise(
@@ -137,27 +94,16 @@ def stabilise(
 ) -> Stabilised | None:
     """Move each frame back by the cameras' motion, beside one found before; None without motion."""
     shape, status = corrected["counts"].shape, result["status"].values
-    steps, slow = np.zeros((*shape[:2], _PARAMETERS)), np.zeros(_PARAMETERS)
+    steps, slow = np.zeros((*shape[:2], PARAMETERS)), np.zeros(PARAMETERS)
     disturbed = np.mean((status & np.uint32(_DISTURBED)) != 0) > _MANY
     if before is None and (disturbed or misfit.common(status == 0)):
         steps = _rapid(corrected, inputs)
         slow = _expected(inputs, steps.mean(axis=0))
     steps[..., :2] += _slow(inputs, misfit)
     motion = steps if before is None else steps + before
-    if not np.any(steps) or max(map(_size, motion)) < _LEAST:
+    if not np.any(steps) or max(map(size_of, motion)) < _LEAST:
         return None
-    counts, good = empty(shape, np.float32), good_pixels(inputs)
-    places, last = _places(shape[2:]), np.reshape(shape[2:], (2, 1, 1)) - 1.0
-    for film, moved, path in zip(counts, corrected["counts"].values, motion, strict=True):
-        for frame, image, step in zip(film, moved, path, strict=True):
-            valid, sources = good & np.isfinite(image), _sources(step, places)
-            whole = _resampled(without_gaps(image, valid), sources)
-            frame[:] = np.where(valid, whole, image)
-            # What was outside of the image was not seen.
-            outside = np.any((sources < -_LEAST) | (sources > last + _LEAST), axis=0)
-            frame[outside & good] = np.nan
-        release()
-    return Stabilised(corrected.assign(counts=corrected["counts"].copy(data=counts)), motion, slow)
+    return Stabilised(moved(corrected, inputs, motion), motion, slow)
 
 
 def _expected(inputs: Inputs, path: Array) -> Array:
@@ -186,16 +132,15 @@ class _Changes(NamedTuple):
 def _rapid(corrected: xr.Dataset, inputs: Inputs) -> Array:
     """Motion (band, time, parameter) [pixel] of images that move rapidly; zero without any."""
     films, bands = corrected["counts"], inputs.bands
-    motion = np.zeros((*films.shape[:2], _PARAMETERS))
-    seen = [[np.isfinite(image).any() for image in film] for film in films.values]
-    frames = np.asarray(np.all(seen, axis=0))
+    motion = np.zeros((*films.shape[:2], PARAMETERS))
+    frames = inputs.frames
     if np.count_nonzero(frames) < inputs.method.minimum_frames:
         return motion
     windows = list(_windows(films, inputs, frames))
     basis = smooth_functions(inputs, frames)
     prior = _COMMON**2 * np.ones((len(bands), len(bands))) + _APART**2 * np.eye(len(bands))
-    precision = np.kron(np.linalg.inv(prior), np.eye(_PARAMETERS))
-    path = np.zeros((len(bands), len(basis), _PARAMETERS))
+    precision = np.kron(np.linalg.inv(prior), np.eye(PARAMETERS))
+    path = np.zeros((len(bands), len(basis), PARAMETERS))
     for turn in range(_TURNS):
         changes = [_changes(window, path, basis) for window in windows]
         if turn < _SEARCHED:  # motion hides the ratios until most of it is undone
@@ -207,10 +152,10 @@ def _rapid(corrected: xr.Dataset, inputs: Inputs) -> Array:
         form, force = (np.sum([pair[it] for pair in pairs], axis=0) for it in (0, 1))
         # Is there any?
         before = np.swapaxes(path, 0, 1).reshape(len(basis), -1)
-        steps, variance = _jackknife(form, force, precision, before)
+        steps, variance = jackknife(form, force, precision, before)
         if turn == 0 and not np.any(np.median(quotient(steps**2, variance, 0.0), axis=0) > _SHAKEN):
             return motion
-        steps = np.swapaxes(steps.reshape(-1, len(bands), _PARAMETERS), 0, 1)
+        steps = np.swapaxes(steps.reshape(-1, len(bands), PARAMETERS), 0, 1)
         path += np.clip(steps, -_STEP, _STEP)
         if np.sqrt(np.mean(steps**2)) < _SETTLED:
             break
@@ -220,24 +165,10 @@ def _rapid(corrected: xr.Dataset, inputs: Inputs) -> Array:
     return motion
 
 
-def _solved(form: Array, force: Array) -> Array:
-    return np.asarray(np.linalg.solve(form, force[..., np.newaxis])[..., 0])
-
-
-def _jackknife(form: Array, force: Array, prior: Array, before: Array) -> tuple[Array, Array]:
-    """Solution of normal equations (window, ...) with a prior, and its variance by a jackknife.
-
-    The prior is on the sum of the solution and what was solved before.
-    """
-    whole, total = form.sum(axis=0) + prior, force.sum(axis=0) - before @ prior
-    reduced = _solved(whole - form, total - force)
-    return _solved(whole, total), np.var(reduced, axis=0) * (len(reduced) - 1)
-
-
 def _windows(films: xr.DataArray, inputs: Inputs, frames: Mask) -> Iterator[_Window]:
     """Yield windows of the image, of some frames (time), without gaps."""
-    good, sides = good_pixels(inputs), []
-    places = _places(good.shape)
+    good, sides = inputs.good, []
+    places = places_of(good.shape)
     longest = np.sqrt(_SAMPLES / np.count_nonzero(frames)) / _WINDOWS - 2 * _AROUND
     for size in good.shape:
         side = max(1, min(int(np.clip(longest, *_SIDES)), size // _WINDOWS))
@@ -262,11 +193,11 @@ def _changes(window: _Window, path: Array, basis: Array) -> _Changes:
     if path.any():
         films = np.empty_like(films)
         for place in np.ndindex(path.shape[:2]):
-            sources = _sources(path[place], window.places)
-            films[place] = _resampled(window.films[place], sources)
+            sources = sources_of(path[place], window.places)
+            films[place] = resampled(window.films[place], sources)
     maps = np.einsum("tj,btyx->bjyx", basis[:, :_SLOW], films)
     signals = films[:, :, window.used]
-    slopes = _along(_gradients(maps)[..., window.used], window.places[:, window.used])
+    slopes = along(gradients(maps)[..., window.used], window.places[:, window.used])
     slopes = np.swapaxes(slopes, 0, 1)
     return _Changes(signals - basis @ (basis.T @ signals), slopes)
 
@@ -313,7 +244,7 @@ def _equations(
             pull -= pull @ basis @ basis.T
             forces.append(np.einsum("tj,ajt->ta", course, pull))
         form, force = np.array(forms), np.array(forces)
-        steps = _solved(form.sum(axis=0) + np.eye(form.shape[-1]) / _COMMON**2, force.sum(axis=0))
+        steps = solved(form.sum(axis=0) + np.eye(form.shape[-1]) / _COMMON**2, force.sum(axis=0))
         moved = np.einsum("ta,tj->taj", steps, course).reshape(len(steps), -1)
         energies = []
         for null, slope in combinations:
@@ -333,13 +264,13 @@ def _slow(inputs: Inputs, misfit: Misfit) -> Array:
     for place, band in enumerate(inputs.bands[1:]) if windows else ():
         form, force = (np.concatenate([sums[place][it] for sums in windows]) for it in (0, 1))
         form, force = form[:, wanted.ravel()][..., wanted.ravel()], force[:, wanted.ravel()]
-        steps, variance = _jackknife(
+        steps, variance = jackknife(
             form, force, np.eye(form.shape[1]) / _TURN**2, np.zeros(form.shape[1])
         )
         # What does not change in time is no motion.
         score, path = np.zeros((2, *wanted.shape))
         score[wanted], path[wanted] = quotient(steps**2, variance, 0.0), steps
-        if np.any(score[1:, :2].mean(axis=0) > _SURE):
+        if np.any(score[1:, :2].mean(axis=0) > SURE):
             motion[band] = _course(time)[:, 1:] @ path[1:, :2]
     return motion
 

@@ -28,6 +28,7 @@ from dbthermal.separation._doubts import against_response, of_one_camera
 from dbthermal.separation._inputs import Inputs, Labels, check, numbered
 from dbthermal.separation._misfit import Misfit
 from dbthermal.separation._motion import drift, stabilise
+from dbthermal.separation._overlay import overlay
 from dbthermal.separation._pooling import materials as pooling
 from dbthermal.separation._pooling.pool import hold
 from dbthermal.separation._reflection import as_gray, restored
@@ -74,7 +75,8 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     with the shift between the cameras' reflections (`alignment.reflection_shift`); then with the
     pixels of each material pooled (`materials`), held to what they tell alone; last, what is still
     unknown is completed (`complete`). Before that, what the model leaves in the bands widens the
-    deviations; if the cameras shake, or the bands are not equally sharp, that is mended first.
+    deviations; if the bands' images lie off each other, the cameras shake, or the bands are not
+    equally sharp, that is mended first.
 
     Parameters
     ----------
@@ -152,8 +154,13 @@ def separate(  # noqa: PLR0913 - all but the first two by name
             measured.inputs, measured.result, workers, drift, sharpness
         )
 
-    # Separate, and widen the bars by what is left.
-    capture, (measured, misfit), mended = _mended(corrected, once)
+    # Lay the images on one another, separate, and widen the bars by what is left.
+    laid = overlay(corrected, inputs) if reflection_shift is None else None
+    capture, (measured, misfit), mended = _mended(laid.capture if laid else corrected, once)
+    if laid:
+        left = laid.detail(measured.inputs, measured.result)
+        misfit = replace(misfit, change=np.hypot(misfit.change, left))
+        mended = laid.sentences() + mended
     if colour is not None:
         capture, scale, (measured, misfit) = as_gray(capture, once, measured, colour)
     result, materials = measured.result, measured.materials

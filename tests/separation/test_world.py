@@ -48,6 +48,14 @@ WORLDS: dict[str, tuple[World, str, str]] = {
         "image moved",
         "",
     ),
+    "registered by 0.3 pixel": (World(off=0.3, detail=DETAIL), "off that of", "fine detail"),
+    "never registered": (World(off=2.0, detail=DETAIL), "off that of", "fine detail"),
+    "never registered, in hand": (
+        World(off=1.0, shake=(0.3, 0.3), detail=DETAIL),
+        "off that of",
+        "cameras shake",
+    ),
+    "never registered, apart": (World(off=1.0, parallax=3.0, detail=DETAIL), "off that of", ""),
     "held in hand, far": (World(shake=(2.0, 2.0)), "image moved", ""),
     "breathing skin": (World(breath=0.5, detail=0.003, surface=(SKIN, SKIN)), "image moved", ""),
 }
