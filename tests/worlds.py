@@ -161,8 +161,8 @@ def seen(world: World, seed: int) -> tuple[xr.Dataset, Array]:
             front = gaussian_filter(views[0][frame], world.roughness[band])
             image = share * curve.counts(warm) + (1.0 - share - clear) * front
             image = gaussian_filter(image + clear * views[1][frame], world.blur[band])
-            film[band, frame] = moved(image, motion[band, frame], *held[frame])[inside, inside]
-            film[band, frame] += noise[frame]
+            view = moved(image, motion[band, frame], *held[frame])
+            film[band, frame] = view[inside, inside] + noise[frame]
     coordinates = {
         "band": list(RIG.bands),
         "time": ("time", time, {"units": "s"}),

@@ -28,7 +28,9 @@ from dbthermal.separation._misfit import Whole
 PARAMETERS: Final = 4
 # Square of a motion over its variance by a jackknife of windows, from which it is undone.
 SURE: Final = 20.0
-_ORDER: Final = 3  # smooth functions of time, of which the first is the mean
+# Functions of time in which an object changes, the mean among them; in which reflections do, too;
+# and energy of the others over that of these, at most, in a window of the object's detail.
+_ORDER, _HIGHEST, _RAPID = 3, 8, 0.1
 _SIDE, _DEGREE = 10, 3  # of a window [pixel], and of what is smooth in it
 _BLURS: Final = (2.0, 1.0, 0.5)  # deviations, from coarse to fine [pixel]
 _MOST, _FEWEST = 64, 4  # windows, of most detail; with detail that both bands show, at least
@@ -176,11 +178,12 @@ def _slow_maps(corrected: xr.Dataset, inputs: Inputs, frames: Whole) -> tuple[Ar
     And what a drift along time brings of each (..., function) into those without the mean.
     """
     counts, good = corrected["counts"], inputs.good
-    course = smooth.polynomial_basis(corrected["time"].values[frames], _ORDER)
-    drift = (course[:, 1:] * course[:, [1]]).T @ course / np.abs(course[:, 1]).max()
+    course = smooth.polynomial_basis(corrected["time"].values[frames], _HIGHEST)
+    slow = course[:, :_ORDER]
+    drift = (slow[:, 1:] * slow[:, [1]]).T @ slow / np.abs(slow[:, 1]).max()
     weights, span = course.T.astype(np.float32), slice(frames[0], frames[-1] + 1)
     used = span if span.stop - span.start == frames.size else frames
-    maps = np.zeros((len(inputs.bands), _ORDER, *good.shape))
+    maps = np.zeros((len(inputs.bands), _HIGHEST, *good.shape))
     for rows in inputs.blocks:
         films = counts[:, used, rows].values
         for rise, band in zip(maps, inputs.bands, strict=True):
@@ -244,11 +247,16 @@ def _displacement(first: Array, second: Array, drift: Array, noise: Array) -> tu
 
     Both are zero if there is none that is sure, matters, and explains what the bands do not share.
     """
-    # Choose the windows of most detail.
+    # Choose the windows of most detail, which changes as the object does: all in slow functions.
     height, width = (size // _SIDE for size in first.shape[1:])
     corners = np.indices((height, width)).reshape(2, -1, 1) * _SIDE
     pixels = corners + np.indices((_SIDE, _SIDE)).reshape(2, 1, -1)
-    most = np.argsort(_Views(first, second, drift, pixels, _BLURS[0]).energy)[-_MOST:]
+    smoothed = gaussian_filter(first[1:], _BLURS[0], axes=(1, 2))
+    energy = np.sum(_detail(smoothed[:, *pixels]) ** 2, axis=2)
+    slow, rapid = (np.mean(part, axis=0) for part in np.split(energy, [_ORDER - 1]))
+    pixels = pixels[:, rapid < _RAPID * slow]
+    most = np.argsort(slow[rapid < _RAPID * slow])[-_MOST:]
+    first, second = first[:_ORDER], second[:_ORDER]
     path, none = np.zeros(PARAMETERS), np.zeros(PARAMETERS)
     # Gauss-Newton, from coarse detail to fine.
     for blur in _BLURS:
