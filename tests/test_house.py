@@ -12,7 +12,7 @@ HOUSE = Path(dbthermal.__file__).parent
 BUDGET = {
     "": (3480, 18),
     "_cli": (1226, 5),
-    "alignment": (2931, 13),
+    "alignment": (2937, 13),
     "calibration": (799, 3),
     "correction": (1779, 7),
     "emissivity": (448, 3),
@@ -26,7 +26,7 @@ BUDGET = {
     "simulation": (570, 3),
     "store": (1431, 6),
 }
-INSTALLED = 37_057  # lines of all rooms
+INSTALLED = 37_063  # lines of all rooms
 
 PRONOUNS = {
     *("one", "other", "others", "own", "part", "parts", "some", "here", "there", "told", "known"),

@@ -125,7 +125,7 @@ def _compared(
     except ValueError:  # without noise nothing tells a shift
         return _at_one_place(corrected, options["search"])
     # Compare clocks and shift in the reduced picture.
-    offset, field, uncertainty = _clocked(small, scale, synchronous, resample)
+    offset, field, uncertainty, tried = _clocked(small, scale, synchronous, resample)
     full_field = None if field is None else _enlarged(field, corrected)
     if field is None or full_field is None or not seen_apart(full_field):
         return _at_one_place(corrected, options["search"])
@@ -136,8 +136,10 @@ def _compared(
     except ValueError:
         rival = None
     shift = np.inf if rival is None else np.nanmedian(np.hypot(*rival["shift"].values))
-    if shift < _SAME and rival is not None and np.diff(_explained(field, rival)) > 0.0:
-        return at_one_place
+    if rival is not None and shift < _SAME:
+        ahead = [np.diff(_explained(trial, rival)) > 0.0 for trial in tried]
+        if np.all(ahead):
+            return at_one_place
     frame = clocks.frame_period(stamps[0])
     if uncertainty <= _PRECISION * frame:
         return Comparison(offset, uncertainty, full_field)
@@ -158,8 +160,11 @@ def _explained(*fields: xr.Dataset) -> tuple[float, ...]:
 
 def _clocked(
     small: xr.Dataset, scale: Scale, synchronous: xr.DataArray, resample: Callable[..., xr.Dataset]
-) -> tuple[xr.DataArray, xr.Dataset | None, float]:
-    """Offsets of the clocks, the shift of the reflections, and the clocks' uncertainty [s]."""
+) -> tuple[xr.DataArray, xr.Dataset | None, float, list[xr.Dataset]]:
+    """Offsets of the clocks, the shift of the reflections, and the clocks' uncertainty [s].
+
+    And the shifts at all offsets that were tried.
+    """
     names, trials = small["band"].values, list[_Trial]()
 
     def compare_at(**clock: Any) -> tuple[xr.DataArray, xr.Dataset | None]:
@@ -171,7 +176,7 @@ def _clocked(
 
     _, field = compare_at(offset=synchronous)
     if field is None:
-        return synchronous, None, np.nan
+        return synchronous, None, np.nan, []
     synchronous_trials, frame = trials.copy(), clocks.frame_period(clocks.exposure_times(small)[0])
     trials.clear()
     try:
@@ -185,10 +190,11 @@ def _clocked(
             break
         offset, field = compare_at(offset=trial)
     if not trials:
-        return offset, field, np.nan
+        return offset, field, np.nan, [] if field is None else [field]
     best, step = _step(trials, frame)
     # The uncertainty is at least the standard deviation of the delay.
-    return best.offset, best.field, float(np.hypot(step, best.field.attrs["delay_std"]))
+    uncertainty = float(np.hypot(step, best.field.attrs["delay_std"]))
+    return best.offset, best.field, uncertainty, [trial.field for trial in trials]
 
 
 @dataclass(frozen=True, eq=False)

@@ -66,7 +66,6 @@ LEAST, FEW, MOST_RMSE = 0.9, 0.05, 1.3
 MISSED = {
     ("lenses blur unlike", 1): "RMSE 1.4 times: details of the object stay unlike",
     ("one way, quick", 2): "0.89 hold: 3 to 5 pixels a frame, as far as the views lie apart",
-    ("one way, late", 1): "0.87 hold: parallax and delay are not told apart by one direction",
     **{
         (
             f"slow filter wheel{stamps}",
