@@ -49,8 +49,9 @@ from dbthermal.separation._subspace.reflection_ratio import HIGHEST_ORDER
 # Prior deviations [pixel] of rapid motion that the bands share, or do not; and of slow motion.
 _COMMON, _APART, _TURN = 3.0, 0.1, 1.0
 # Square of rapid motion over its variance by a jackknife of windows, median over the frames, from
-# which it is undone: at most 2 without any, 9 to 28 of 0.3 pixel.
-_SHAKEN: Final = 5.0
+# which it is undone: at most 2 without any, 4.5 where heat spreads; 9 to 28 of 0.3 pixel, 7 to 10
+# of a turn by 0.6 degrees.
+_SHAKEN: Final = 6.0
 _SLOW: Final = 3  # smooth functions in which the image's gradients change
 _LEAST: Final = 0.1  # motion of a band that matters, rms [pixel]: two depths feign 0.06
 # Of rapid motion: side of a window, least and most, and what is read around it [pixel]; samples of
@@ -150,10 +151,11 @@ def _rapid(corrected: xr.Dataset, inputs: Inputs) -> Array:
             for place, ratio in enumerate(ratios, 1)
         ]
         form, force = (np.sum([pair[it] for pair in pairs], axis=0) for it in (0, 1))
-        # Is there any?
+        # Is there any? A growth is no evidence: heat that spreads feigns one, with up to 76.
         before = np.swapaxes(path, 0, 1).reshape(len(basis), -1)
         steps, variance = jackknife(form, force, precision, before)
-        if turn == 0 and not np.any(np.median(quotient(steps**2, variance, 0.0), axis=0) > _SHAKEN):
+        score = np.median(quotient(steps**2, variance, 0.0), axis=0).reshape(len(bands), -1)
+        if turn == 0 and not np.any(score[:, :-1] > _SHAKEN):
             return motion
         steps = np.swapaxes(steps.reshape(-1, len(bands), PARAMETERS), 0, 1)
         path += np.clip(steps, -_STEP, _STEP)

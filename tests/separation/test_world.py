@@ -42,7 +42,6 @@ WORLDS: dict[str, tuple[World, str, str]] = {
     "clocks apart": (World(fast=5e-4), "", ""),
     "held in hand": (World(shake=(1.0, 1.0), detail=DETAIL), "image moved", ""),
     "turned": (World(turn=0.6, detail=DETAIL), "image moved", "fine detail"),
-    "nearer and farther": (World(sway=0.01, detail=DETAIL), "image moved", "fine detail"),
     "held in hand, turned": (
         World(shake=(1.0, 1.0), turn=0.6, sway=0.005, detail=DETAIL),
         "image moved",
