@@ -125,13 +125,13 @@ def calibrate(options: argparse.Namespace) -> dict[str, Any]:
         return files.saved(response, options)
     # Movies of a blackbody: statistics of each pixel, then one curve for all.
     blackbody = _blackbody(options)
-    known = {name: blackbody.attrs[name] for name in ACCURACY if name in blackbody.attrs}
+    accuracies = {name: blackbody.attrs[name] for name in ACCURACY if name in blackbody.attrs}
     if "frame" in blackbody.dims:
         blackbody = correction.blackbody_statistics(blackbody)
     fitted = correction.fit_correction(blackbody) if "y" in blackbody.dims else None
     counts = blackbody["counts"] if fitted is None else fitted["level"]
-    known |= accepted(calibration.fit_response, options)
-    response = calibration.fit_response(counts, blackbody.get("noise"), **known)
+    accuracies |= accepted(calibration.fit_response, options)
+    response = calibration.fit_response(counts, blackbody.get("noise"), **accuracies)
     # The response names the files that it was fitted to.
     named = leaves([options.at, options.blackbody, options.sweep])
     paths = [str(leaf) for leaf in named if isinstance(leaf, str | Path) and leaf != PLUS]

@@ -208,7 +208,7 @@ def _check_pieces(array: Any, path: Path) -> None:
     if size > max(_recording.SMALL, array.nbytes):
         raise ValueError(f"Invalid chunk of {size} bytes of '{name}'. Must be its size at most.")
     # Contents of their size, for HDF5 takes any: one that packing does not shorten is as it is.
-    before, after = (4 * part.count(_SUM) for part in (codes[:packer], codes[packer:]))
+    before, after = (4 * steps.count(_SUM) for steps in (codes[:packer], codes[packer:]))
     for place, mask, length in chunks:
         is_whole = length == size + before + after
         if packer < len(codes) and not mask:
@@ -291,8 +291,8 @@ def _check_unpacked(values: zarr.Array[Any], keys: list[Path], path: Path) -> No
         rule = f"Must be one of {[*_UNPACKED]}"
         raise ValueError(f"Invalid compressors {kinds} of '{path.name}'. {rule}.")
     for key in keys if kinds else ():
-        parts = math.prod(pieces) // math.prod(values.chunks)
-        for packed in _pieces(key.read_bytes(), parts if values.shards else 0):
+        number = math.prod(pieces) // math.prod(values.chunks)
+        for packed in _pieces(key.read_bytes(), number if values.shards else 0):
             if not _UNPACKED[kinds[0]](packed, size):
                 label = f"chunk '{key.name}' of '{path.name}'"
                 raise ValueError(f"Damaged {label}. Must be whole, and unpack to {size} bytes.")

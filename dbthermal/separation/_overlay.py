@@ -10,8 +10,7 @@ What rests tells nothing, for it may be mirrored, which cameras apart see displa
 """
 
 from dataclasses import dataclass
-from itertools import product
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import xarray as xr
@@ -29,9 +28,10 @@ PARAMETERS: Final = 4
 # Square of a motion over its variance by a jackknife of windows, from which it is undone.
 SURE: Final = 20.0
 # Functions of time in which an object changes, the mean among them; in which reflections do, too;
-# and energy of the others over that of these, at most, in a window of the object's detail.
+# and energy of the second kind over that of the first, at most, in a window: 0.01 to 0.1 of an
+# object's detail, 0.2 or more of people who walk by slowly.
 _ORDER, _HIGHEST, _RAPID = 3, 8, 0.1
-_SIDE, _DEGREE = 10, 3  # of a window [pixel], and of what is smooth in it
+_SIDE, _DEGREE = 10, 3  # of a window [pixel], and of the polynomial that is smooth in it
 _BLURS: Final = (2.0, 1.0, 0.5)  # deviations, from coarse to fine [pixel]
 _MOST, _FEWEST = 64, 4  # windows, of most detail; with detail that both bands show, at least
 # Share of a window's detail that the bands have in common, at least; and what is left of all else,
@@ -40,6 +40,10 @@ _ALIKE, _LEFT = 0.5, 0.87
 _PRIOR: Final = 2.0  # deviation [pixel] of a parameter
 _TURNS, _SETTLED, _STEP = 8, 0.01, 1.0  # steps at most; rms that ends them; longest [pixel]
 _LEAST: Final = 0.1  # displacement that matters, rms along an axis [pixel]
+# Orthonormal polynomials (pixel, power) of the places in a window.
+_PLACES: Final = np.indices((_SIDE, _SIDE)).reshape(2, -1) / _SIDE - 0.5
+_POWERS: Final = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
+_SMOOTH: Final = np.linalg.qr(np.stack([np.prod(_PLACES.T**it, axis=1) for it in _POWERS], 1))[0]
 
 
 @dataclass(frozen=True)
@@ -79,9 +83,9 @@ def along(slopes: Array, places: Array) -> Array:
 
 
 def sources_of(step: Array, places: Array, pixels: Whole | None = None) -> Array:
-    """Where (axis, ...) [pixel] pixels at places are in an image, if it is moved by a step.
+    """Places (axis, ...) [pixel] in an image that become pixels of the image moved by a step.
 
-    Of all pixels in the window of the places, or of some of an image.
+    Of the pixels at places, counted from the first of these, or with stated pixels (axis, ...).
     """
     down, right, turn, growth = step
     y, x = places
@@ -196,10 +200,7 @@ def _slow_maps(corrected: xr.Dataset, inputs: Inputs, frames: Whole) -> tuple[Ar
 
 def _detail(values: Array) -> Array:
     """What is not smooth in windows (..., pixel)."""
-    y, x = (axis.ravel() / _SIDE - 0.5 for axis in np.indices((_SIDE, _SIDE)))
-    powers = [it for it in product(range(_DEGREE + 1), repeat=2) if sum(it) <= _DEGREE]
-    polynomials = np.linalg.qr(np.stack([y**i * x**j for i, j in powers], axis=1))[0]
-    return np.asarray(values - values @ polynomials @ polynomials.T)
+    return np.asarray(values - values @ _SMOOTH @ _SMOOTH.T)
 
 
 class _Views:
@@ -228,14 +229,9 @@ class _Views:
     def compared(self, path: Array) -> tuple[Array, Array, Mask]:
         """Of each window: scale, remainder (function, window, pixel), and if both show detail."""
         sources = sources_of(path, self.places, self.pixels)
-        values = _detail(
-            np.array(
-                [
-                    map_coordinates(spline, sources, order=3, mode="mirror", prefilter=False)
-                    for spline in self.splines
-                ]
-            )
-        )
+        options: dict[str, Any] = {"order": 3, "mode": "mirror", "prefilter": False}
+        images = [map_coordinates(spline, sources, **options) for spline in self.splines]
+        values = _detail(np.array(images))
         shared = np.sum(self.detail * values, axis=(0, 2))
         alike = shared**2 > _ALIKE * self.energy * np.sum(values**2, axis=(0, 2))
         scale = quotient(shared, self.energy, 0.0)
@@ -253,7 +249,7 @@ def _displacement(first: Array, second: Array, drift: Array, noise: Array) -> tu
     pixels = corners + np.indices((_SIDE, _SIDE)).reshape(2, 1, -1)
     smoothed = gaussian_filter(first[1:], _BLURS[0], axes=(1, 2))
     energy = np.sum(_detail(smoothed[:, *pixels]) ** 2, axis=2)
-    slow, rapid = (np.mean(part, axis=0) for part in np.split(energy, [_ORDER - 1]))
+    slow, rapid = (np.mean(planes, axis=0) for planes in np.split(energy, [_ORDER - 1]))
     pixels = pixels[:, rapid < _RAPID * slow]
     most = np.argsort(slow[rapid < _RAPID * slow])[-_MOST:]
     first, second = first[:_ORDER], second[:_ORDER]
@@ -268,9 +264,9 @@ def _displacement(first: Array, second: Array, drift: Array, noise: Array) -> tu
                 return none, none
             least = variance[1] + scale**2 * variance[0]
             weight = (scale / np.maximum(np.mean(remainder**2, axis=(0, 2)), least))[alike]
-            slopes, left = views.slopes[:, :, alike], remainder[:, alike]
+            slopes, residual = views.slopes[:, :, alike], remainder[:, alike]
             form = np.einsum("w,afwp,bfwp->wab", weight * scale[alike], slopes, slopes)
-            force = np.einsum("w,afwp,fwp->wa", weight, slopes, left)
+            force = np.einsum("w,afwp,fwp->wa", weight, slopes, residual)
             steps, spreads = jackknife(
                 form, force, np.eye(len(slopes)) / _PRIOR**2, np.append(path, [0.0, 0.0])
             )
