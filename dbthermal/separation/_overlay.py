@@ -33,6 +33,9 @@ SURE: Final = 20.0
 _ORDER, _HIGHEST, _RAPID = 3, 8, 0.1
 _SIDE, _DEGREE = 10, 3  # of a window [pixel], and of the polynomial that is smooth in it
 _BLURS: Final = (2.0, 1.0, 0.5)  # deviations, from coarse to fine [pixel]
+# Whole displacements [pixel] that are tried first, along an axis; and what of the most in common
+# is nearly as much, so that no displacement by a period of a pattern is preferred to none.
+_REACH, _NEARLY = 4, 0.9
 _MOST, _FEWEST = 64, 4  # windows, of most detail; with detail that both bands show, at least
 # Share of a window's detail that the bands have in common, at least; and what is left of all else,
 # at most: 0.93 or more in 110 simulated scenes without displacement, up to 0.85 with 0.3 pixel.
@@ -154,6 +157,13 @@ class Laid(Moved):
             if path.any()
         ]
 
+    def remaining_shift(self, field: xr.Dataset) -> xr.Dataset:
+        """Shift of the reflections between the images as laid, of that between them before."""
+        others = self.motion[self.capture["band"].values != self.reference, 0]
+        places = places_of(field["known"].shape)
+        displacement = sources_of(-others.mean(axis=0), places) - np.indices(places.shape[1:])
+        return field.assign(shift=field["shift"] - displacement.astype(np.float32))
+
 
 def overlay(corrected: xr.Dataset, inputs: Inputs) -> Laid | None:
     """Lay the images of the other bands on that of the first; None if they lie there."""
@@ -213,9 +223,8 @@ class _Views:
         self, first: Array, second: Array, drift: Array, pixels: Whole, blur: float
     ) -> None:
         smoothed = gaussian_filter(first, blur, axes=(1, 2))
-        self.splines = [
-            spline_filter(gaussian_filter(image, blur), mode="mirror") for image in second[1:]
-        ]
+        self.images = gaussian_filter(second[1:], blur, axes=(1, 2))
+        self.splines = [spline_filter(image, mode="mirror") for image in self.images]
         self.pixels, self.places = pixels, places_of(first.shape[1:])[:, *pixels]
         # The slopes are the first's, whose noise is not that of the others.
         slopes = gradients(smoothed)[:, :, *pixels]
@@ -225,6 +234,21 @@ class _Views:
         slopes = _detail(np.concatenate([along(slopes[:, 1:], self.places), drifting]))
         common = quotient(np.sum(slopes * self.detail, axis=(1, 3)), self.energy, 0.0)
         self.slopes = slopes - common[:, np.newaxis, :, np.newaxis] * self.detail
+
+    def nearest(self) -> Array:
+        """Least whole displacement (parameter) at which the bands have nearly most in common."""
+        last = np.reshape(self.images.shape[1:], (2, 1, 1)) - 1
+        trials = np.indices((2 * _REACH + 1,) * 2).reshape(2, -1, 1, 1) - _REACH
+        common = []
+        for displacement in trials.swapaxes(0, 1):
+            sources = np.clip(self.pixels - displacement, 0, last)
+            values = _detail(self.images[:, *sources])
+            shared = np.sum(self.detail * values, axis=(0, 2))
+            energy = self.energy * np.sum(values**2, axis=(0, 2))
+            common.append(np.sum(quotient(shared**2, energy, 0.0)))
+        size = np.sum(trials**2, axis=0).ravel()
+        size[common < _NEARLY * max(common)] = size.max() + 1
+        return np.append(trials[:, np.argmin(size), 0, 0], [0.0, 0.0])
 
     def compared(self, path: Array) -> tuple[Array, Array, Mask]:
         """Of each window: scale, remainder (function, window, pixel), and if both show detail."""
@@ -257,6 +281,7 @@ def _displacement(first: Array, second: Array, drift: Array, noise: Array) -> tu
     # Gauss-Newton, from coarse detail to fine.
     for blur in _BLURS:
         views = _Views(first, second, drift, pixels[:, most], blur)
+        path = path if path.any() else views.nearest()
         variance = noise**2 / (4.0 * np.pi * blur**2)
         for _ in range(_TURNS):
             scale, remainder, alike = views.compared(path)

@@ -143,19 +143,26 @@ def separate(  # noqa: PLR0913 - all but the first two by name
         level = None if surroundings is None else float(np.mean(surroundings))
         colour = colour_of(background_ratio, names, inputs.bands[0], level, surroundings_std)
     response = inputs.response  # with one noise for all steps
+    if reflection_shift is not None:
+        displaced.check(reflection_shift, corrected, inputs.bands[0])
     unlike = against_response(corrected, response) + of_one_camera(corrected, response)
+
+    # Lay the images on one another.
+    laid = overlay(corrected, inputs)
+    shift = reflection_shift
+    if laid and shift is not None:
+        shift = laid.remaining_shift(shift)
 
     def once(capture: xr.Dataset) -> tuple[Measured, Misfit]:
         scope = inputs
         if capture is not corrected:
             scope = check(capture, response, inputs.method, settings=settings)
-        measured = _separated(capture, scope, reflection_shift, materials, workers, progress)
+        measured = _separated(capture, scope, shift, materials, workers, progress)
         return measured, misfits.measure(
             measured.inputs, measured.result, workers, drift, sharpness
         )
 
-    # Lay the images on one another, separate, and widen the bars by what is left.
-    laid = overlay(corrected, inputs) if reflection_shift is None else None
+    # Separate, and widen the bars by what is left.
     capture, (measured, misfit), mended = _mended(laid.capture if laid else corrected, once)
     if laid:
         left = laid.detail(measured.inputs, measured.result)
