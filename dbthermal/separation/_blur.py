@@ -21,6 +21,7 @@ from scipy.ndimage import (
     minimum_filter,
     uniform_filter,
 )
+from scipy.signal import fftconvolve
 
 from dbthermal import _smooth as smooth
 from dbthermal._arrays import Array, empty, quotient, release
@@ -198,8 +199,8 @@ def _equations(
     ratio = result["reflection_ratio"].values[inputs.bands[place], rows]
     inner = np.zeros(shape, dtype=bool)
     inner[_EDGE:-_EDGE, _EDGE:-_EDGE] = True
-    used = inner & pixels.reshape(shape) & np.isfinite(ratio)
-    ratio = np.where(used, ratio, 1.0)
+    moving = pixels.reshape(shape) & np.isfinite(ratio)
+    ratio, used = np.where(moving, ratio, 1.0), inner & moving
     # At the border of a material reflectivities change, not reflections.
     within = maximum_filter(ratio, _BORDER) < _ALIKE * minimum_filter(ratio, _BORDER)
     used &= within | (np.count_nonzero(used & within) < _MOSTLY * np.count_nonzero(used))
@@ -216,11 +217,12 @@ def _equations(
     def rapid(film: Array) -> Array:
         return film - np.tensordot(basis, np.tensordot(basis.T, film, 1), 1)
 
+    # Where the ratio is not that of the pixels around, or none, broad parts do not compare.
     first, second = (
-        np.stack([_details(image, blur) for image in films[order].reshape(-1, *shape)])
-        for order, blur in zip((0, place), blurs, strict=True)
+        np.stack([_details(image * part, blur) for image in films[order].reshape(-1, *shape)])
+        for order, part, blur in zip((0, place), (moving, moving / ratio), blurs, strict=True)
     )
-    remainder, reflection = rapid(second / ratio - first), rapid(first)
+    remainder, reflection = rapid(second - first), rapid(first)
     curvature = rapid(laplace(first, axes=(1, 2)))
     # Noise in the products: that of the first band, in all three.
     free = len(basis) - basis.shape[1]
@@ -230,7 +232,7 @@ def _equations(
     spread = _details(point, blurs[0])
     bent = laplace(spread)
     level, mixed, bending = (
-        free * levels[0] * np.sum(a * b)
+        free * levels[0] * fftconvolve(moving, a * b, mode="same")
         for a, b in ((spread, spread), (spread, bent), (bent, bent))
     )
     products = (
@@ -243,7 +245,7 @@ def _equations(
     # The error of the ratio, of a neighbourhood, is eliminated.
     local = [
         uniform_filter(np.where(used, values, 0.0), _AROUND, mode="constant")
-        for values in (*products, np.full(shape, _MOVING * level))
+        for values in (*products, _MOVING * level)
     ]
     used &= local[2] > local[5]
     share = quotient(local[3], local[2], 0.0)

@@ -22,8 +22,9 @@ _SAMPLES: Final = 2**24  # of a band that tell a step of a camera's level, at mo
 _FEWEST: Final = 100  # pixels that tell it
 _PAUSE: Final = 1.5  # frame periods, from which two frames do not follow one another
 _AROUND: Final = 9  # frames whose median change is the scene's that goes on
-# Deviations of a step; share of it, and deviations, of what another band shows of the scene.
-_CERTAIN, _SHARE, _SIGMAS = 16.0, 0.15, 4.0
+# Deviations of a step by noise, and by flicker, of which 280 frames have up to 3.7; share of it,
+# and deviations, of what another band shows of the scene.
+_CERTAIN, _RARE, _SHARE, _SIGMAS = 16.0, 6.0, 0.15, 4.0
 _EVEN: Final = 0.5  # difference of mean and median, relative to a step of all pixels
 
 
@@ -86,10 +87,11 @@ def of_one_camera(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
         np.where(seen, film - median_filter(film, (1, _AROUND)), 0.0)
         for film in (np.where(seen, mean, 0.0), np.where(seen, middle, 0.0))
     )
+    flicker = MAD * np.median(np.abs(mean[:, seen]), axis=1)  # of whole frames
     unseen = np.abs(mean) + _SIGMAS * noise[:, np.newaxis]
     for place, size in enumerate(np.abs(mean)):
         single = np.all(np.delete(unseen, place, axis=0) < _SHARE * size, axis=0)
-        single &= size > _CERTAIN * noise[place]
+        single &= size > max(_CERTAIN * noise[place], _RARE * flicker[place])
         # In proportion to what moves, as a median is not; which is the same if all pixels step.
         single &= np.abs(median[place] - mean[place]) < _EVEN * size
         if single.any():

@@ -65,6 +65,10 @@ def test_a_step_of_one_camera_is_told(glass_plate: Scene, band: int, kelvin: flo
     both = capture.copy(deep=True)
     both["counts"] += kelvin * late * xr.DataArray([115.0, 2 * 11.5], dims="band")
     assert steps(both) == []  # the room's light is switched
+    flickering = capture.copy(deep=True)
+    noise = np.random.default_rng(1).normal(0.0, 0.05, capture.sizes["time"])  # K, of all pixels
+    flickering["counts"][band] += slopes[band] * xr.DataArray(noise, dims="time")
+    assert steps(flickering) == []
     # A resampling of one band left out where most of the change is: what it keeps cancels.
     kelvins = np.resize([4.0, -2.0, 4.0, 2.0, 4.0, 0.0, 4.0, -2.0, 2.0], both["counts"].shape[2:])
     moved = xr.DataArray(kelvins, dims=("y", "x"))

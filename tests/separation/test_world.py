@@ -13,7 +13,7 @@ from worlds import RESPONSE, SHAPE, World, seen
 from dbthermal import alignment, separation
 from dbthermal.schema import Status
 
-SKIN, PLASTIC = (0.93, 0.85), (0.75, 0.60)
+SKIN, PLASTIC, METAL = (0.93, 0.85), (0.75, 0.60), (0.20, 0.10)
 DETAIL = 0.01
 # Situation, the warning that it earns, and the situation without it, whose error is compared.
 WORLDS: dict[str, tuple[World, str, str]] = {
@@ -28,6 +28,7 @@ WORLDS: dict[str, tuple[World, str, str]] = {
     "fabrics": (World(fabric=(0.92, 0.80)), "", ""),
     "rough surface": (World(roughness=(2.0, 2.8)), "not equally sharp", ""),
     "second camera sharper": (World(blur=(1.2, 0.4)), "not equally sharp", ""),
+    "metal beside paint": (World(surface=(METAL, (0.93, 0.82))), "", ""),
     "lock-in": (World(lamp=0.3), "", ""),
     "foil": (World(behind=(0.10, 0.15), surface=(PLASTIC, PLASTIC)), "", ""),
     "one way": (World(together=True, parallax=3.0), "", ""),
