@@ -17,6 +17,7 @@ import xarray as xr
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 
 from dbthermal import _smooth as smooth
+from dbthermal import schema
 from dbthermal._arrays import Array, Mask, empty, quotient, release
 from dbthermal._samples import without_gaps
 from dbthermal.separation._inputs import Inputs
@@ -157,8 +158,12 @@ class Laid(Moved):
             if path.any()
         ]
 
-    def remaining_shift(self, field: xr.Dataset) -> xr.Dataset:
+    def remaining_shift(self, field: xr.Dataset | None) -> xr.Dataset | None:
         """Shift of the reflections between the images as laid, of that between them before."""
+        if field is None:
+            return None
+        schema.require(field, xr.Dataset, "reflection_shift")
+        schema.check(field, "reflection_shift")
         others = self.motion[self.capture["band"].values != self.reference, 0]
         places = places_of(field["known"].shape)
         displacement = sources_of(-others.mean(axis=0), places) - np.indices(places.shape[1:])

@@ -143,15 +143,11 @@ def separate(  # noqa: PLR0913 - all but the first two by name
         level = None if surroundings is None else float(np.mean(surroundings))
         colour = colour_of(background_ratio, names, inputs.bands[0], level, surroundings_std)
     response = inputs.response  # with one noise for all steps
-    if reflection_shift is not None:
-        displaced.check(reflection_shift, corrected, inputs.bands[0])
     unlike = against_response(corrected, response) + of_one_camera(corrected, response)
 
     # Lay the images on one another.
     laid = overlay(corrected, inputs)
-    shift = reflection_shift
-    if laid and shift is not None:
-        shift = laid.remaining_shift(shift)
+    shift = laid.remaining_shift(reflection_shift) if laid else reflection_shift
 
     def once(capture: xr.Dataset) -> tuple[Measured, Misfit]:
         scope = inputs
