@@ -298,11 +298,11 @@ class Status(Flags):
     What to do about each is in docs/status.md; `has_flag` asks for some by name.
     """
 
-    NO_BACKGROUND_MOTION = 1 << 0, "no rapid change of the reflection: nothing is estimated"
+    NO_BACKGROUND_MOTION = 1 << 0, "no rapid change of the reflection: nothing is measured"
     CONSTANT_OBJECT = 1 << 1, "constant object: its temperature is valid, nothing else is given"
-    GRAY = 1 << 2, "the emissivities of the bands hardly differ: no temperature is given"
+    GRAY = 1 << 2, "the emissivities of the bands hardly differ: no temperature is measured"
     BACKGROUND_NEVER_RESTS = 1 << 3, "reflection at rest in few frames: emissivity may be biased"
-    NONPHYSICAL_EMISSIVITY = 1 << 4, "estimated emissivity outside (0, 1): no temperature is given"
+    NONPHYSICAL_EMISSIVITY = 1 << 4, "estimated emissivity outside (0, 1): temperature not measured"
     INVALID_SAMPLES = 1 << 5, "too many samples NaN, infinite or masked: nothing is estimated"
     CONSTANT_SIGNAL = 1 << 6, "the signal of a band never changes: nothing is estimated"
     SATURATED = 1 << 7, "samples at the limit of the detector, or many at the same level"

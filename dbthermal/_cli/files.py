@@ -150,7 +150,7 @@ def capture(paths: list[Path], options: argparse.Namespace, offset: Any) -> xr.D
         cameras = [[path] for path in paths]
     if len(cameras) < 2 or paths.count(PLUS) not in {0, len(cameras) - 1}:
         label = f"Invalid {len(paths)} files: which are of the second camera is not clear"
-        raise ValueError(f"{label}. Must be one of each, or: a*.tif + b*.tif.")
+        raise ValueError(f"{label}. Must be one of each camera, or: a*.tif + b*.tif.")
     if options.bands is None:
         raise ValueError("Missing --bands. Must name all, such as: --bands 8-14 9.5.")
     for name, values in {"clock": options.clock or (), "variable": options.variable or ()}.items():

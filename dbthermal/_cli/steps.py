@@ -52,7 +52,7 @@ dbthermal explore result.zarr -o look.ipynb"""
 """At most five, that take the files to a report and to the explorer."""
 _SCENE: Final = (
     "simulated, by no camera: a plate of glass (left) and concrete (right) with a cross of black "
-    "tape, heated from 22 to 60 degC while people walk by"
+    "tape, its middle heated from 22 to 60 degC while people walk by"
 )
 
 _OUTPUTS: Final = {

@@ -56,7 +56,7 @@ def answer(result: xr.Dataset, materials: xr.Dataset | None = None) -> tuple[lis
     else:
         sentences.append("No object temperature at any pixel.")
     # Shares of the pixels.
-    remainder = f"completed from what else is known: {completed.mean():.0%}"
+    remainder = f"completed, not measured: {completed.mean():.0%}"
     sentences.append(f"Measured: {measured.mean():.0%} of the pixels; {remainder}.")
     # Materials, and what to watch out for.
     numbers["materials"] = listed = by_material(result, measured, table)

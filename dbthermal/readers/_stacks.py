@@ -245,7 +245,7 @@ def _pages(path: Path) -> list[_Page]:
             _check_apart(file, pages)
     except _recording.DAMAGE as error:
         refused = "Must " in str(error)
-        state, rule = ("Invalid", "") if refused else ("Damaged", ". Must be whole, or BigTIFF.")
+        state, rule = ("Invalid", "") if refused else ("Damaged", ". Must be a whole TIFF/BigTIFF.")
         raise ValueError(f"{state} TIFF '{path.name}': {error}{rule}") from error
     finally:
         log.removeHandler(handler)

@@ -134,15 +134,15 @@ def _offsets(cameras: Sequence[xr.Dataset], offset: Any) -> list[float]:
     if offset is None:
         dates = [recording.attrs.get("start") for recording in cameras]
         if None in dates:
-            raise ValueError("Unknown dates of the recordings. Must be given as offset= [s].")
+            rule = "Must be given as offset= [s], start of the second minus start of the first"
+            raise ValueError(f"Unknown dates of the recordings. {rule}; 0.0 if together.")
         begun, *later = (datetime.fromisoformat(str(date)) for date in dates)
         return [(date - begun).total_seconds() for date in later]
     offsets = list(offset) if isinstance(offset, list | tuple) else [offset]
     for value in offsets:
         _recording.check_number(value, "offset")
     if len(offsets) != len(cameras) - 1:
-        rule = f"Must be {len(cameras) - 1}, one for each recording after the first"
-        raise ValueError(f"Invalid offset {offset} s. {rule}.")
+        raise ValueError(f"Invalid offset {offset} s. Must be one for each later recording.")
     return offsets
 
 
@@ -186,7 +186,7 @@ def _check(recording: xr.Dataset, name: str) -> None:
     over_time = dict.fromkeys(("time", "exposure_time", "frame_flags"), ("time",))
     for variable, dims in {"counts": ("time", "y", "x"), **over_time}.items():
         if variable not in recording or recording[variable].dims != dims:
-            actual = recording[variable].dims if variable in recording else "nothing"
+            actual = recording[variable].dims if variable in recording else "missing"
             label, rule = f"'{variable}' is {actual}", f"Must be {dims}, as from a reader"
             raise ValueError(f"Invalid recording of band '{name}': {label}. {rule}.")
         array, label = recording[variable], f"'{variable}' of band '{name}'"

@@ -108,8 +108,8 @@ OTHERS: dict[str, tuple[Callable[[xr.Dataset], xr.Dataset], str]] = {
     "crop": (lambda one: one.isel(x=slice(1, None)), r"Different sizes \(24, 32\) and \(24, 31\)"),
     "undated": (lambda one: one.drop_attrs(deep=False), r"Unknown dates .* offset="),
     "temperatures": (lambda one: one.astype("f4"), "Invalid dtype float32 of .* of band '9.5'"),
-    "picture": (lambda one: one.drop_vars("exposure_time"), "'exposure_time' is nothing"),
-    "timeless": (lambda one: one.drop_vars("time"), "'time' is nothing"),
+    "picture": (lambda one: one.drop_vars("exposure_time"), "'exposure_time' is missing"),
+    "timeless": (lambda one: one.drop_vars("time"), "'time' is missing"),
 }
 
 

@@ -84,7 +84,7 @@ def test_the_answer_and_the_author_come_first(tmp_path: Path) -> None:
     head = page.partition("<h2")[0]
     assert "A. Tester, a.tif and b.tif" in head
     assert "Object from 26.9 to 31.6 \N{DEGREE SIGN}C, typically \N{PLUS-MINUS SIGN} 0.03 K" in head
-    assert "Measured: 95% of the pixels; completed from what else is known: 4%." in head
+    assert "Measured: 95% of the pixels; completed, not measured: 4%." in head
     found = numbers(page)["answer"]
     assert found["measured"] == pytest.approx(1 - 9 / 192)
     materials = {entry["nearest"][0]["material"]: entry for entry in found["materials"]}
