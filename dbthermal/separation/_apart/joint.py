@@ -197,7 +197,7 @@ def solve(
         places, sampled = equations.solved, looked_at(result.sizes["time"])
         if pooled and frames.smooth:
             sampled = frames.nodes
-        change = system.change(inputs, equations.ways[relaxation.LOOSE])
+        change = system.change(inputs, equations.ways[relaxation.LOOSE], solved)
         if maps is not None:
             target, size = _by_maps(inputs, maps, raw, material, places)
         else:
