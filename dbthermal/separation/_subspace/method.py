@@ -65,7 +65,7 @@ from dbthermal.separation._inputs import Method, check_fields
 from dbthermal.separation._quality import status_bits
 from dbthermal.separation._subspace import division, fused, pieces, reflection_ratio
 from dbthermal.separation._subspace.fused import FILMS, Solution
-from dbthermal.separation._tiles import Estimate, Mask, Tile, Whole
+from dbthermal.separation._tiles import BROKEN, Estimate, Mask, Tile, Whole
 
 # Thresholds of the flags, in standard deviations.
 _CONTRAST_SIGMAS: Final = 8.0
@@ -74,7 +74,6 @@ _CORRELATION_SIGMAS: Final = 3.5
 _DELAY_SIGMAS: Final = 4.0
 # Deviation by noise of an emissivity outside (0, 1) from which it says nothing [1].
 _UNKNOWN: Final = 0.1
-_BROKEN: Final = np.uint32(Status.OBJECT_NOT_SMOOTH | Status.BANDS_APART)
 _HARDLY_CHANGES: Final = np.uint32(Status.CONSTANT_OBJECT | Status.NONPHYSICAL_EMISSIVITY)
 # Ratios of two emissivities of one material [1]: 98 of 100 of the libraries lie in 0.78 to 1.21, in
 # whatever order their bands are.
@@ -200,7 +199,7 @@ def _report(tile: Tile, solution: Solution) -> Estimate:
     # The ratio of an object that is taken for the background is that of emissivities.
     exchanged = (status & np.uint32(Status.ROLES_MAY_BE_SWAPPED)) != 0
     exchanged &= (status & _HARDLY_CHANGES) != 0
-    sound = ((status & _BROKEN) == 0) & ~exchanged
+    sound = ((status & BROKEN) == 0) & ~exchanged
     return replace(result, survey=solution.survey(sound, status == 0))
 
 
