@@ -46,6 +46,8 @@ _TOGETHER: Final = 2**23
 _NOISE_STEP: Final = 0.05  # resampled samples whose noise differs by less are separated together
 RANGE_SIGMAS: Final = 5.0  # standard deviations beyond the calibrated range that are flagged
 USELESS: Final = 1e6  # temperature [K], emissivity [1] or deviation beyond which is no result
+BROKEN: Final = np.uint32(Status.OBJECT_NOT_SMOOTH | Status.BANDS_APART)
+"""Flags of a model that does not hold: the pixel tells nothing of its material."""
 
 _MAPS: Final = ("emissivity", "reflection_ratio")
 WITHOUT_STD: Final = ("object_temperature_std", "background_temperature_std", "emissivity_std")

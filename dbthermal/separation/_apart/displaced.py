@@ -80,11 +80,8 @@ class Displacement:
     def weights(self, rows: slice, source: slice) -> csr_array:
         """Weights of the pixels of some rows of the source, for those of some rows."""
         width = self.shape[1]
-        start = self.resample.indptr[rows.start * width : rows.stop * width + 1]
-        entries = slice(start[0], start[-1])
-        columns = self.resample.indices[entries] - source.start * width
-        shape = (start.size - 1, (source.stop - source.start) * width)
-        return csr_array((self.resample.data[entries], columns, start - start[0]), shape=shape)
+        pixels, around = (slice(span.start * width, span.stop * width) for span in (rows, source))
+        return csr_array(self.resample[pixels, around])
 
 
 def check(field: xr.Dataset, corrected: xr.Dataset, reference: int) -> Displacement:
@@ -97,14 +94,12 @@ def check(field: xr.Dataset, corrected: xr.Dataset, reference: int) -> Displacem
     field = laid_on(field, corrected, label, "the capture")
     if [str(name) for name in field["axis"].values] != ["y", "x"]:
         raise ValueError(f"Invalid axis {field['axis'].values.tolist()} of {label}. Must be y, x.")
-    shift = field["shift"].values.astype(np.float64)
-    std = field["shift_std"].values.astype(np.float64)
-    trusted = field["known"].values
+    shift, std = (field[name].values.astype(np.float64) for name in ("shift", "shift_std"))
     size = np.array(shift.shape[1:])
     finite = np.all(schema.measured(shift), axis=0)
     if not np.any(finite):
         raise ValueError(f"Invalid {label[4:]} without a number. Must be finite somewhere.")
-    if np.any(trusted & ~finite):
+    if np.any(field["known"].values & ~finite):
         raise ValueError(f"Invalid {label[4:]}: no number where it is known. Must be finite there.")
     if np.any(~(std[:, finite] >= 0) | ~schema.measured(std[:, finite])):
         raise ValueError(f"Invalid shift_std of {label}. Must be zero or positive, and finite.")
@@ -195,10 +190,8 @@ def paired(
 
     The source is read if they are not kept; only those of a small capture are.
     """
-    films, key = displacement.read, (rows.start, rows.stop)
-    every = chosen = (*key, b"")
-    if not isinstance(selected, slice):
-        chosen = (*key, selected.tobytes())
+    films, every = displacement.read, (rows.start, rows.stop, b"")
+    chosen = every if isinstance(selected, slice) else (*every[:2], selected.tobytes())
     if chosen not in films:
         reading = films.get(every)
         if reading is None:

@@ -19,16 +19,11 @@ from dbthermal.response import Curve
 from dbthermal.separation import _quality as quality
 from dbthermal.separation._apart import relaxation
 from dbthermal.separation._apart.displaced import without
+from dbthermal.separation._apart.relaxation import Floats
 from dbthermal.separation._inputs import Inputs
-from dbthermal.separation._subspace.reflection_ratio import (
-    CHANCE,
-    HIGHEST_ORDER,
-    null_combination,
-    ratio_variance,
-)
+from dbthermal.separation._subspace import reflection_ratio
+from dbthermal.separation._subspace.reflection_ratio import null_combination, ratio_variance
 from dbthermal.separation._tiles import Mask, Material, Whole
-
-Floats = npt.NDArray[np.floating[Any]]
 
 _LARGEST: Final = 0.95  # share of an error that a step may leave
 # Emissivities by which x(p) is told: no closer to the ends of what the ratios leave [1].
@@ -69,12 +64,6 @@ class Equations:
         """Values (solved pixel, ...) over all pixels, 0 elsewhere."""
         result = np.zeros((self.first.size, *values.shape[1:]), dtype=values.dtype)
         result[self.solved] = values
-        return result
-
-    def other_bands(self, shares: Floats, signal: Floats) -> Floats:
-        """Sum of shares (band - 1, pixel) times u_m(x), of u_1(x) (pixel, frame) [K]."""
-        result = np.empty(signal.shape)
-        relaxation.other_bands(np.ascontiguousarray(shares), self.bends, signal, result)
         return result
 
     def solve(self, target: Floats, start: Floats, change: Floats) -> tuple[Floats, Floats, Floats]:
@@ -199,7 +188,7 @@ def of_material(inputs: Inputs, raw: Floats, material: Material) -> tuple[Floats
     """
     ratio = np.where(np.isfinite(material.ratio), material.ratio, ratio_of(raw))
     variance = null_combination(ratio, inputs.noise[inputs.bands])[1]
-    sharp = material.inverse_energy * variance < 1.0 / chdtri(len(raw) - 1, CHANCE)
+    sharp = material.inverse_energy * variance < 1.0 / chdtri(len(raw) - 1, reflection_ratio.CHANCE)
     ratio = np.where(sharp, ratio, ratio_of(raw))
     first = np.where(np.isfinite(material.emissivity) & sharp, material.emissivity, raw[0])
     return np.asarray(1.0 - ratio * (1.0 - first)), sharp & np.isfinite(material.ratio[-1])
@@ -258,11 +247,8 @@ def samples(inputs: Inputs, frames: Whole) -> tuple[Floats, Floats]:
 
     A sample that is no measurement is 0, an outlier of the regression.
     """
-    capture, reference, width = inputs.capture, inputs.bands[0], inputs.capture.sizes["x"]
-    counts = capture["counts"].isel(band=reference, time=frames).values
-    counts = np.where(schema.measured(counts), counts, np.nan).reshape(frames.size, -1)
-    curve, functions = inputs.curves[reference], smooth_functions(capture)
-    first = np.nan_to_num(curve.linearise(counts) - curve.reference)
+    functions, width = smooth_functions(inputs.capture), inputs.capture.sizes["x"]
+    first = np.nan_to_num(_signal(inputs, time=frames)).reshape(frames.size, -1)
     steps = np.zeros_like(first)
     if functions.steps:
         of_camera = functions.functions - functions.object_part
@@ -286,15 +272,15 @@ def change(inputs: Inputs, loose: Whole, solved: Mask) -> Change:
     at_p = without(displacement.resample[loose], bad, displacement.shape[1])
     unknown = abs(at_p) @ bad > 0.0
     across = displacement.onward[loose]  # at r + d(r), nearly as far from r as p
-    turned = (abs(at_p) @ ~solved > 0.0) & (abs(across) @ ~solved == 0.0) & (across.sum(axis=1) > 0)
+    turned = ~unknown & (abs(at_p) @ ~solved > 0.0)
+    turned &= (abs(across) @ ~solved == 0.0) & (across.sum(axis=1) > 0.0)
     # Only the pixels that they are made of are read.
     pixels = np.unique(np.concatenate([loose, at_p.indices, across.indices]))
     film = _film(inputs, pixels).T
     at_r = film[np.searchsorted(pixels, loose)]
     moved, opposite = at_p[:, pixels] @ film - at_r, at_r - across[:, pixels] @ film
     differing = (moved - opposite) @ functions.functions @ functions.object_part.T
-    moved[turned], unknown = opposite[turned], unknown & ~turned
-    moved[unknown] = 0.0
+    moved[turned], moved[unknown] = opposite[turned], 0.0
     curves = moved @ functions.functions
     error = moved - curves @ functions.functions.T
     energy, lagged = (error**2).sum(axis=1), (error[:, 1:] * error[:, :-1]).sum(axis=1)
@@ -318,17 +304,20 @@ def _bad(inputs: Inputs) -> Mask:
 
 def _film(inputs: Inputs, pixels: Whole) -> Floats:
     """Signal (time, pixel) [K] of some pixels of the reference band, its gaps bridged."""
-    capture, curve = inputs.capture, inputs.curves[inputs.bands[0]]
-    places = np.divmod(pixels, capture.sizes["x"])
+    places = np.divmod(pixels, inputs.capture.sizes["x"])
     row, column = (xr.DataArray(place, dims="pixel") for place in places)
-    counts = capture["counts"].isel(band=inputs.bands[0], y=row, x=column).values
-    counts = np.where(schema.measured(counts), counts, np.nan)
-    film = curve.linearise(counts) - curve.reference
+    film = _signal(inputs, y=row, x=column)
     return np.nan_to_num(bridge(film, np.ones(pixels.size, dtype=bool)))
+
+
+def _signal(inputs: Inputs, **places: Any) -> Floats:
+    """Signal [K] of the reference band at some places; NaN for a sample that is no measurement."""
+    curve = inputs.curves[inputs.bands[0]]
+    counts = inputs.capture["counts"].isel(band=inputs.bands[0], **places).values
+    return curve.linearise(np.where(schema.measured(counts), counts, np.nan)) - curve.reference
 
 
 def smooth_functions(capture: xr.Dataset, frames: Any = slice(None)) -> smooth.Subspace:
     """Smooth functions of the frames of a capture, with the steps of the camera."""
     time = capture["time"].values[frames].astype(np.float64)
-    order = min(HIGHEST_ORDER, time.size // 4)
-    return smooth.subspace(time, order, segment=schema.segments(capture)[frames])
+    return reflection_ratio.smooth_functions(time, schema.segments(capture)[frames])

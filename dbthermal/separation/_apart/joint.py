@@ -27,16 +27,15 @@ import numpy as np
 import xarray as xr
 from scipy.ndimage import convolve, distance_transform_edt, gaussian_filter, gaussian_filter1d
 
-from dbthermal import _smooth as smooth
 from dbthermal._arrays import copied, release
 from dbthermal.schema import Status
 from dbthermal.separation._apart import equations as system
 from dbthermal.separation._apart import neighbours, relaxation
-from dbthermal.separation._apart.equations import Floats
 from dbthermal.separation._apart.planes import Planes
+from dbthermal.separation._apart.relaxation import Floats
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._subspace import regression
-from dbthermal.separation._subspace.reflection_ratio import HIGHEST_ORDER, null_combination
+from dbthermal.separation._subspace.reflection_ratio import null_combination, smooth_functions
 from dbthermal.separation._tiles import USELESS, Mask, Material, Whole
 
 _OBJECT: Final = ("object_temperature", "object_temperature_std")
@@ -83,7 +82,7 @@ class Frames:
         """
         film, std = (result[name].values.reshape(result.sizes["time"], -1) for name in _OBJECT)
         time, every = result["time"].values, np.arange(len(film))
-        functions = smooth.subspace(time, min(HIGHEST_ORDER, time.size // 4)).functions
+        functions = smooth_functions(time).functions
         count = _NODES * functions.shape[1]
         place = 0.5 * (1.0 - np.cos(np.pi * (np.arange(count) + 0.5) / count)) * np.ptp(time)
         nodes = np.unique(np.abs(time - time[0] - place[:, np.newaxis]).argmin(axis=1))
@@ -140,7 +139,7 @@ class Joint:
         assert displacement is not None
         time, std = self.inputs.capture["time"].values, result["object_temperature_std"].values
         background = result["background_temperature"].values
-        basis = smooth.subspace(time, min(HIGHEST_ORDER, time.size // 4)).functions
+        basis = smooth_functions(time).functions
         every = []
         for rows in self.inputs.blocks:
             film = background[:, rows].reshape(time.size, -1).astype(np.float64)
@@ -198,10 +197,10 @@ def solve(
         if pooled and frames.smooth:
             sampled = frames.nodes
         change = system.change(inputs, equations.ways[relaxation.LOOSE], solved)
+        shares = system.coefficients(inputs, raw, solved)[:, places]
         if maps is not None:
             target, size = _by_maps(inputs, maps, raw, material, places)
         else:
-            shares = system.coefficients(inputs, raw, solved)[:, places]
             target, size = _by_film(inputs, result, raw, equations, shares, before)
 
         def objects_at(
@@ -218,8 +217,8 @@ def solve(
         if sampled is frames.nodes and before is not None and before.frames.smooth:
             start = before.signals[0][:, places].T
         at_r, at_p, step = objects_at(sampled, equations, start)
-        second = system.coefficients(inputs, raw, solved)[1:, places].sum(axis=0)
-        share = np.abs(second[:, np.newaxis] * (at_p - at_r)) / size[:, np.newaxis]
+        second = shares[1:].sum(axis=0)[:, np.newaxis]
+        share = np.abs(second * (at_p - at_r)) / size[:, np.newaxis]
         if not _most(share) > _MATTERS:
             return None
         # The emissivities, if they are not those of a material.
@@ -327,8 +326,10 @@ def _by_film(
     def target(at: Whole) -> tuple[Floats, Floats]:
         signal = np.asarray(curve.signal(film[at][:, places]) - curve.reference)
         signal = np.ascontiguousarray(signal.T, dtype=np.float32)
+        second = np.empty(signal.shape)
+        relaxation.other_bands(np.ascontiguousarray(shares[1:]), equations.bends, signal, second)
         q = shares[0][:, np.newaxis] * signal
-        q += equations.packed.other_bands(shares[1:], signal)
+        q += second
         if before is not None:  # part of q that the inputs of the result were without
             q += np.einsum("bp,btp->pt", weights, before.at(at, places))
         return q, signal
@@ -382,16 +383,15 @@ def _emission(
     the camera in it (frame, solved).
     """
     signal = places[0].T.astype(np.float64)
-    line = regression.lines(signal, np.asarray(band[0], np.float64), noise)
+    slope, variance, energy, kernel = regression.lines(signal, band[0], noise)
     # A gradient as steep as the object's own change turns the step round: divide by it.
     centred = places[0] - places[0].mean(axis=1, keepdims=True)
-    slope = (centred * places[1]).sum(axis=1) / (centred**2).sum(axis=1)
-    steep = np.where(np.isfinite(slope) & (slope > 1.0), slope, 1.0)
+    steep = (centred * places[1]).sum(axis=1) / (centred**2).sum(axis=1)
+    steep = np.where(np.isfinite(steep) & (steep > 1.0), steep, 1.0)
     # Its variance: of the noise, and what the steps of the camera are as a slope.
-    by_steps = (line.kernel(signal) * band[1]).sum(axis=0)
-    variance = (line.variance + by_steps**2) / steep**2
-    sound = line.energy > _LEAST_CHANGE**2 * len(signal)
-    return emissivity + (line.slope - emissivity) / steep, variance, sound
+    variance = (variance + (kernel * band[1]).sum(axis=0) ** 2) / steep**2
+    sound = energy > _LEAST_CHANGE**2 * len(signal)
+    return emissivity + (slope - emissivity) / steep, variance, sound
 
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")

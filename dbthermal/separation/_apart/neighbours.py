@@ -23,15 +23,15 @@ from dbthermal._arrays import Array
 from dbthermal._samples import neighbour_mean
 from dbthermal.schema import Status
 from dbthermal.separation._apart import equations as system
-from dbthermal.separation._apart.equations import Floats
 from dbthermal.separation._apart.planes import TAIL, Planes, Scatters
+from dbthermal.separation._apart.relaxation import Floats
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._pooling import pool
 from dbthermal.separation._pooling.ratios import Image
 from dbthermal.separation._quality import Bits
 from dbthermal.separation._subspace.bars import NORMAL95
 from dbthermal.separation._subspace.reflection_ratio import energy_of_variance, principal_ratio
-from dbthermal.separation._tiles import Mask, Material, Survey
+from dbthermal.separation._tiles import BROKEN, Mask, Material, Survey
 
 BLUR: Final = 1.0
 """Deviation of the blur of the bands whose ratios are compared [pixel]."""
@@ -39,8 +39,6 @@ BLUR: Final = 1.0
 BLURS: Final = (0.0, BLUR, 2.0 * BLUR)
 """Those of a material, each wider than the one before."""
 
-# Flags of a model that does not hold: the pixel tells nothing of its material.
-_BROKEN: Final = np.uint32(Status.OBJECT_NOT_SMOOTH | Status.BANDS_APART)
 # Deviation of the neighbourhood in which ratios are compared: that of a field and its data [pixel].
 _WIDE: Final = 6.0
 # Windows along the image's smaller side, and how many of a material have a jackknife.
@@ -128,7 +126,7 @@ def _survey(
     status = per_pixel["status"].values.ravel()[places]
     emissivity = per_pixel["emissivity"].sel(band=per_pixel.attrs["reference_band"]).values
     value = np.where(status == 0, emissivity.ravel()[places], np.nan)
-    sound = ((status & _BROKEN) == 0) & ~scatters.apart[places]
+    sound = ((status & BROKEN) == 0) & ~scatters.apart[places]
     scale = scatters.noise[:, places] / noise[:, np.newaxis]  # whitened by the noise of samples
     scatter = np.where(sound, scatters.scatter[..., places] * scale * scale[:, np.newaxis], 0.0)
     frames = np.where(sound, scatters.freedom[places], 0.0)

@@ -27,6 +27,7 @@ from dbthermal.response import Curve
 from dbthermal.separation import _quality as quality
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._apart import equations as system
+from dbthermal.separation._apart.relaxation import Floats
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._subspace import reflection_ratio
 
@@ -39,7 +40,6 @@ _DEGREE: Final = 7
 _LEAST_SHARE: Final = 1e-3  # share of a neighbourhood without which a blurred pixel is none [1]
 # Deviations of noise across the axis of the ratios from which the bands are apart.
 _APART: Final = 8.0
-_TINY: Final = float(np.finfo(np.float64).tiny)
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class Planes:
         """
         whole = np.einsum("bp,bcp->cp", weights, self.smooth[..., pixels])
         noise = self.noise[0].reshape(len(weights), -1)[:, pixels]
-        variance = np.maximum(((weights * noise) ** 2).sum(axis=0), _TINY)
+        variance = np.maximum(((weights * noise) ** 2).sum(axis=0), reflection_ratio.TINY)
         frames, orders = len(self.object_part), len(whole) - self.steps
         energy = np.cumsum(whole[::-1] ** 2, axis=0)[::-1][self.steps :] / variance
         lowest = min(reflection_ratio.LOWEST_ORDER, orders - 1)
@@ -125,9 +125,7 @@ class Planes:
         return Scatters(scatter, freedom, noise, usable)
 
 
-def project(
-    inputs: Inputs, result: xr.Dataset, emissivity: system.Floats, threads: Executor
-) -> Planes:
+def project(inputs: Inputs, result: xr.Dataset, emissivity: Floats, threads: Executor) -> Planes:
     """Planes of a capture, by the object in a result of it and emissivities (band, pixel) [1]."""
     bands, (height, width) = inputs.bands, result["status"].shape
     rapid, columns = _functions(inputs), system.smooth_functions(inputs.capture)

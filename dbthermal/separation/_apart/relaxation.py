@@ -6,10 +6,10 @@ import numpy as np
 import numpy.typing as npt
 
 from dbthermal._compiled import compiled
+from dbthermal._smooth import Whole
 from dbthermal.separation._subspace.kernels import inlined
 
 Floats = npt.NDArray[np.floating[Any]]
-Whole = npt.NDArray[np.intp]
 
 # Steps of the iteration, and the change that ends it [K].
 _STEPS: Final = 60

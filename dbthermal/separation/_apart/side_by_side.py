@@ -96,14 +96,12 @@ def pooled(
             inputs, source, threads, frames, maps=maps, material=material, before=objects
         )
         if objects is None:  # the object hardly differs between the places
-            inputs = replace(inputs, difference=None)
             break
         sound = source["status"].values.ravel() == 0
         changes, shares = np.abs(objects.emissivity - shares)[:, sound], objects.emissivity
         if sound.any() and np.median(changes) < _SETTLED:
             break
-    if objects is not None:
-        inputs = replace(inputs, difference=objects.difference)
+    inputs = replace(inputs, difference=None if objects is None else objects.difference)
     separate_pixels(inputs, material)
     if objects is not None:
         objects.finish(result)

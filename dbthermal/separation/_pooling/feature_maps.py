@@ -17,7 +17,7 @@ from dbthermal import response as responses
 from dbthermal import schema
 from dbthermal._arrays import Array, Mask, release
 from dbthermal.noise import MAD
-from dbthermal.separation._pooling.region_merging import Labels
+from dbthermal.separation._inputs import Labels
 
 _ROWS: Final = 64  # rows of a capture that are read at a time
 # Standard deviation of the Gaussian window of the edge statistic, and distance of the windows'

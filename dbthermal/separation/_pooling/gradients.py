@@ -55,22 +55,21 @@ class Left:
     """Residual of a polynomial in the costs of pixels, or in their sums over squares (part,)."""
 
     residual: Array  # of b
-    cost: Cost
+    square: Array  # a
+    variance: Array  # v
 
     def excess(self, spread: float = 0.0) -> tuple[float, float]:
         """Variance of q that residuals show beyond v, and its deviation at some spread."""
-        square, variance = self.cost.square**2, self.cost.variance
-        deviation = np.sqrt(2.0 * np.sum((variance + spread * square) ** 2))
-        total = float(np.sum(square))
-        return float(np.sum(self.residual**2 - variance)) / total, float(deviation) / total
+        deviation = np.sqrt(2.0 * np.sum((self.variance + spread * self.square**2) ** 2))
+        total = float(np.sum(self.square**2))
+        return float(np.sum(self.residual**2 - self.variance)) / total, float(deviation) / total
 
     def over_squares(self, places: Places, side: int) -> "Left":
         """Sums over squares of the image with so many pixels along a side."""
         rows, columns = (place // side for place in places)
         group = np.unique(rows * (1 + columns.max()) + columns, return_inverse=True)[1]
-        arrays = self.residual, self.cost.square, self.cost.linear, self.cost.variance
-        residual, *cost = (np.bincount(group, array).astype(np.float64) for array in arrays)
-        return Left(residual, Cost(*cost))
+        arrays = self.residual, self.square, self.variance
+        return Left(*(np.bincount(group, array).astype(np.float64) for array in arrays))
 
 
 @dataclass(frozen=True)
@@ -100,8 +99,8 @@ def fit(measured: Places, asked: Places, cost: Cost, limit: int = DEGREE) -> Gra
         residual = cost.linear - cost.square * (functions @ coefficients)
         fits.append((functions, inverse, coefficients, residual))
     if not fits:  # no pixel tells anything
-        nothing = np.full(asked[0].size, np.nan)
-        return Gradient(0, nothing, nothing, (Left(np.zeros(pixels), cost),) * 2)
+        nothing, zero = np.full(asked[0].size, np.nan), np.zeros(pixels)
+        return Gradient(0, nothing, nothing, (Left(zero, cost.square, cost.variance),) * 2)
     # What pixels scatter beyond the highest degree is no gradient of theirs.
     beyond = np.sum(fits[-1][-1] ** 2 - cost.variance) / np.sum(cost.square**2)
     variance = cost.variance + max(float(beyond), 0.0) * cost.square**2
@@ -120,8 +119,9 @@ def fit(measured: Places, asked: Places, cost: Cost, limit: int = DEGREE) -> Gra
     functions, inverse, _, _ = fits[more]
     covariance = _covariance(functions, inverse, variance if chosen else cost.variance)
     at = _powers(asked, measured, more)
-    left, side = Left(residual, cost), round(np.sqrt(_TOGETHER * asked[0].size / pixels))
-    lefts = left, left.over_squares(measured, max(side, 1))
+    left = Left(residual, cost.square, cost.variance)
+    side = max(1, round(np.sqrt(_TOGETHER * asked[0].size / pixels)))
+    lefts = left, left.over_squares(measured, side)
     return Gradient(chosen, value, np.einsum("pi,ij,pj->p", at, covariance, at), lefts)
 
 

@@ -31,8 +31,9 @@ from dbthermal import response as responses
 from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
 from dbthermal.schema import Status
+from dbthermal.separation._inputs import Labels
 from dbthermal.separation._pooling import feature_maps, region_merging
-from dbthermal.separation._pooling.region_merging import Features, Labels, Regions
+from dbthermal.separation._pooling.region_merging import Features, Regions
 from dbthermal.separation._subspace.reflection_ratio import ratio_variance
 from dbthermal.separation._tiles import Material
 

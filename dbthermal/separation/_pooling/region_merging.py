@@ -9,14 +9,12 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 from scipy.ndimage import binary_dilation, distance_transform_cdt
 from scipy.special import chdtri
 
 from dbthermal._arrays import Array, Mask
+from dbthermal.separation._inputs import Labels
 from dbthermal.separation._pooling import gradients
-
-Labels = npt.NDArray[np.intp]
 
 # Difference of the ratios beside a border, relative to these, that no gradient makes [1], and in
 # deviations; variance of a median of normal values over that of their mean.

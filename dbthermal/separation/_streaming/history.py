@@ -12,10 +12,9 @@ from dbthermal.schema import Status
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._quality import Bits
-from dbthermal.separation._streaming.kernels import APART
+from dbthermal.separation._streaming.kernels import APART, Planes
 from dbthermal.separation._subspace.method import METHOD, separate_smooth
 
-Planes = npt.NDArray[np.float32]
 Threads = Callable[[Callable[[Any], None], Iterable[Any]], None]
 
 _SAMPLES: Final = 128  # at most; half of them at least, once they were as many

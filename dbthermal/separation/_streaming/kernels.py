@@ -8,16 +8,14 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from dbthermal._compiled import kept
+from dbthermal._compiled import compiled
 from dbthermal.schema import LARGEST, Status
 from dbthermal.separation._frames import bridge, newton, null_weights
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._subspace import bars, kernels
-from dbthermal.separation._subspace.kernels import Table, allocating
+from dbthermal.separation._subspace.kernels import Table
 from dbthermal.separation._tiles import RANGE_SIGMAS, USELESS, Array
 from dbthermal.separation._windows import intersect
-
-_entered: Final = kept(**kernels.ALLOCATING)
 
 Planes = npt.NDArray[np.float32]
 
@@ -121,7 +119,7 @@ ROWS: Final = (18, 5)
 """Numbers of scratch rows: terms of each pixel, see `_object`; films of a frame and their range."""
 
 
-@_entered
+@compiled
 def absorb(frames: Planes, mean: Planes, top: int, stop: int) -> None:
     """Means (band, y, x) of frames (band, frame, y, x) [count] in some rows, in place.
 
@@ -139,7 +137,7 @@ def absorb(frames: Planes, mean: Planes, top: int, stop: int) -> None:
             second[x] /= count
 
 
-@allocating
+@compiled
 def _add(first: Any, second: Any, total: Any, second_total: Any, number: Any) -> None:
     """Add a frame's row to the sums, and to the number of samples that are numbers in both."""
     for x in range(first.size):
@@ -149,7 +147,7 @@ def _add(first: Any, second: Any, total: Any, second_total: Any, number: Any) ->
         number[x] += _ONE if valid else _ZERO
 
 
-@allocating
+@compiled
 def _fitted(
     means: Any, slopes: tuple[float, float], fit: Fit, w: Any, null: float, curve: Any
 ) -> float:
@@ -174,7 +172,7 @@ def _fitted(
     return variance
 
 
-@allocating
+@compiled
 def _object(
     camera: Camera, curve: Any, maps: Any, noise: Any, variance: float, w: Any, line: Any, x: int
 ) -> None:
@@ -228,7 +226,7 @@ def _object(
         line[15 + i][x] = maps[4 + i]
 
 
-@allocating
+@compiled
 def _frame(first: Any, second: Any, line: Any, camera: Camera, dt: float, out: Any) -> None:
     """Temperatures of a row of one frame, their deviations, and if they are in range, in place."""
     table, second_table, scale = camera.first, camera.second, _ONE / camera.first.half
@@ -263,7 +261,7 @@ def _frame(first: Any, second: Any, line: Any, camera: Camera, dt: float, out: A
         out[4][x] = _ONE if high | low else out[4][x]
 
 
-@allocating
+@compiled
 def _terms(block: Block, fit: Fit, camera: Camera, y: int, x: int, work: Any) -> None:
     """Terms of one pixel of a row, NaN where the object is not defined; see `_object`."""
     (line, means, curve, maps, pairs), status = work, block.status[y, x]
@@ -293,7 +291,7 @@ def _terms(block: Block, fit: Fit, camera: Camera, y: int, x: int, work: Any) ->
     _object(camera, curve, maps, noise, variance, w, line, x)
 
 
-@_entered
+@compiled
 def emit(
     block: Block, fit: Fit, camera: Camera, single: Camera, scratch: Any, top: int, stop: int
 ) -> None:

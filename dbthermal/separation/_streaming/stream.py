@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -380,5 +379,4 @@ class Stream:
         self._gain[:] = np.sqrt((weights**2).sum(axis=1)).reshape(self._shape)
         unpaired = (np.diff(weights.indptr) == 0).reshape(self._shape)
         self._status |= quality.status_bits({Status.NO_REFLECTION_PAIR: unpaired})
-        edges = [rows.start * width for rows in self._rows] + [weights.shape[0]]
-        self._resample = [weights[start:stop] for start, stop in pairwise(edges)]
+        self._resample = [weights[rows.start * width : rows.stop * width] for rows in self._rows]

@@ -17,7 +17,7 @@ background: of two lines that explain the data the object's is the one with fewe
 
 from functools import lru_cache
 from math import acos, sqrt
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,10 +26,6 @@ from dbthermal._arrays import Array, Mask
 from dbthermal.separation._subspace import joining, kernels, pieces
 from dbthermal.separation._subspace.kernels import compiled
 from dbthermal.separation._tiles import Whole
-
-# Samples that are turned at once, to stay in the cache, and the fewest pixels.
-_TURNED: Final = 2**13
-_BLOCK: Final = 8
 
 
 class Tree(NamedTuple):
@@ -49,7 +45,6 @@ class Tree(NamedTuple):
 class Scratch(NamedTuple):
     """Work space of one pixel."""
 
-    white: Array  # signals of some pixels (pixel, 2, time)
     across: Array  # (time)
     products: Array  # with all functions of the pieces (2, product)
     energy: Array  # first, mixed and last element of the scatter of each piece (3, piece)
@@ -79,7 +74,6 @@ def divide(white: Array, time: Array, segment: Whole | None, stated: Array) -> t
     frames, pixels = white.shape[1:]
     count, axes = len(tree.edges), len(tree.starts) + bool(np.isfinite(stated).any())
     scratch = Scratch(
-        white=np.empty((max(_BLOCK, _TURNED // frames), 2, frames)),
         across=np.empty(frames),
         products=np.empty((2, tree.held[-1])),
         energy=np.empty((3, count)),
@@ -98,7 +92,8 @@ def divide(white: Array, time: Array, segment: Whole | None, stated: Array) -> t
         begins=np.empty((pieces.AXES, frames), dtype=bool),
     )
     first, cost = np.empty((2, pixels, frames), dtype=bool), np.empty((2, pixels))
-    _divide(tree, np.ascontiguousarray(white), np.ascontiguousarray(stated), scratch, first, cost)
+    rows = np.ascontiguousarray(white.transpose(2, 0, 1)), np.ascontiguousarray(stated.T)
+    _divide(tree, *rows, scratch, first, cost)
     return first.mT, cost
 
 
@@ -337,20 +332,10 @@ def _near(axis: Array, taken: Array, count: int, angle: float) -> bool:
 def _divide(
     tree: Tree, white: Array, stated: Array, scratch: Scratch, first: Mask, cost: Array
 ) -> None:
-    """Divisions of all pixels of a tile."""
-    begins, block = scratch.begins, len(scratch.white)
-    for start in range(0, white.shape[2], block):
-        together = white[:, :, start : start + block]
-        for axis in range(2):
-            for t in range(together.shape[1]):
-                for p in range(together.shape[2]):
-                    scratch.white[p, axis, t] = together[axis, t, p]
-        for p in range(start, min(start + block, white.shape[2])):
-            _pixel(tree, scratch, scratch.white[p - start], stated[:, p], begins)
-            for rank in range(2):
-                best = 0
-                for number in range(1, pieces.AXES):
-                    if scratch.costs[number] < scratch.costs[best]:
-                        best = number
-                cost[rank, p], scratch.costs[best] = scratch.costs[best], np.inf
-                kernels.copy(begins[best], first[rank, p])
+    """Divisions of all pixels of signals (pixel, 2, time)."""
+    for p in range(len(white)):
+        _pixel(tree, scratch, white[p], stated[p], scratch.begins)
+        for rank in range(2):
+            best = np.argmin(scratch.costs)
+            cost[rank, p], scratch.costs[best] = scratch.costs[best], np.inf
+            kernels.copy(scratch.begins[best], first[rank, p])

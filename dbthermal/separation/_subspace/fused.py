@@ -373,9 +373,7 @@ def solve(
         space["coefficients"], space["columns"] = np.empty((bands, count)), np.empty(count)
         space["scatter"] = np.empty((of_part.orders, bands, bands))
         _separate(model, signals, places, materials, Work(**space), solved)
-    named: dict[str, Any] = {
-        name: record[name].transpose(*range(1, record[name].ndim), 0) for name in RECORD.names or ()
-    }
+    named: dict[str, Any] = {name: np.moveaxis(record[name], 0, -1) for name in RECORD.names or ()}
     squares = matrices.transpose(1, 2, 3, 0)
     named |= {
         "beyond": named["beyond"] > 0,

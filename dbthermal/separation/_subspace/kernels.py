@@ -40,10 +40,6 @@ entered: Final[Callable[..., Any]] = kept(**_OPTIONS)
 _FLAGS: Final = {"reassoc", "contract", "nsz", "arcp"}
 compiled: Final[Callable[..., Any]] = njit(fastmath=_FLAGS, **_OPTIONS)
 """Decorator of functions that are compiled into those that call them."""
-ALLOCATING: Final[dict[str, Any]] = _OPTIONS | {"fastmath": _FLAGS, "_nrt": True}
-allocating: Final[Callable[..., Any]] = njit(**ALLOCATING)
-"""As `compiled`, for functions that make arrays."""
-
 _WITHIN: Final[dict[str, Any]] = _OPTIONS | {"forceinline": True, "no_cpython_wrapper": True}
 inlined: Final[Callable[..., Any]] = njit(fastmath=_FLAGS, **_WITHIN)
 """As `compiled`, for what has a work space: to hand over its some 300 numbers takes long."""
@@ -69,8 +65,7 @@ class Table(NamedTuple):
 
 def rows(curves: Sequence[Curve]) -> Array:
     """Responses of some bands (band, number), on one range, for `response`."""
-    tables = [table(curve, *(more for more in curves if more is not curve)) for curve in curves]
-    return np.array([np.hstack(row) for row in tables])
+    return np.array([np.hstack(table(curve, *curves)) for curve in curves])
 
 
 @compiled

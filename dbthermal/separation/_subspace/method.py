@@ -65,7 +65,7 @@ from dbthermal.separation._inputs import Method, check_fields
 from dbthermal.separation._quality import status_bits
 from dbthermal.separation._subspace import division, fused, pieces, reflection_ratio
 from dbthermal.separation._subspace.fused import FILMS, Solution
-from dbthermal.separation._tiles import Estimate, Mask, Tile, Whole
+from dbthermal.separation._tiles import BROKEN, Estimate, Mask, Tile, Whole
 
 # Thresholds of the flags, in standard deviations.
 _CONTRAST_SIGMAS: Final = 8.0
@@ -74,7 +74,6 @@ _CORRELATION_SIGMAS: Final = 3.5
 _DELAY_SIGMAS: Final = 4.0
 # Deviation by noise of an emissivity outside (0, 1) from which it says nothing [1].
 _UNKNOWN: Final = 0.1
-_BROKEN: Final = np.uint32(Status.OBJECT_NOT_SMOOTH | Status.BANDS_APART)
 _HARDLY_CHANGES: Final = np.uint32(Status.CONSTANT_OBJECT | Status.NONPHYSICAL_EMISSIVITY)
 # Ratios of two emissivities of one material [1]: 98 of 100 of the libraries lie in 0.78 to 1.21, in
 # whatever order their bands are.
@@ -120,16 +119,37 @@ class SubspaceSettings:
             raise ValueError(f"Invalid background_drift {drift} K. Must be zero or positive.")
 
 
+@np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def separate(tile: Tile, settings: SubspaceSettings) -> Estimate:
-    """Separate one tile of two bands or more."""
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        return _followed(tile, settings)
+    """Separate one tile of two bands or more.
+
+    A pixel keeps its division of the time from a pass before, unless it has a flag.
+    """
+    functions, kept, drift = _functions(tile), tile.division, settings.background_drift
+    if kept is None or not kept.any():
+        return _searched(tile, functions, drift)
+    places = np.flatnonzero(kept.any(axis=0))
+    chosen, first = tile.select_pixels(places), kept[:, places]
+    solution = fused.solve(chosen, functions, drift, _parts(chosen, first, functions))
+    estimate = _report(chosen, solution)
+    sound = estimate.status == 0
+    estimate = _finished(chosen, estimate, first, functions)
+    searched = np.ones(kept.shape[1], dtype=bool)
+    searched[places[sound]] = False
+    if not searched.any():
+        return estimate
+    result = _searched(tile.select_pixels(searched), functions, drift)
+    result = result.select_pixels(np.maximum(np.cumsum(searched) - 1, 0))
+    if result.division is None:
+        result = replace(result, division=np.zeros_like(kept))
+    result.replace_pixels(places[sound], estimate.select_pixels(sound))
+    return result
 
 
+@np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def separate_smooth(tile: Tile, settings: SubspaceSettings) -> Estimate:
     """Separate one tile of objects that change smoothly, without pieces of time."""
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        return _report(tile, fused.solve(tile, _functions(tile), settings.background_drift))
+    return _report(tile, fused.solve(tile, _functions(tile), settings.background_drift))
 
 
 def _functions(tile: Tile) -> smooth.Subspace:
@@ -140,10 +160,8 @@ def _functions(tile: Tile) -> smooth.Subspace:
 @lru_cache(maxsize=4)
 def _known_functions(times: bytes, events: bytes | None) -> smooth.Subspace:
     """Smooth functions over some times: most tiles have the same."""
-    time = np.frombuffer(times)
     segment = None if events is None else np.frombuffer(events, dtype=np.intp)
-    order = min(reflection_ratio.HIGHEST_ORDER, time.size // 4)
-    return smooth.subspace(time, order, segment=segment)
+    return reflection_ratio.smooth_functions(np.frombuffer(times), segment)
 
 
 def _report(tile: Tile, solution: Solution) -> Estimate:
@@ -181,7 +199,7 @@ def _report(tile: Tile, solution: Solution) -> Estimate:
     # The ratio of an object that is taken for the background is that of emissivities.
     exchanged = (status & np.uint32(Status.ROLES_MAY_BE_SWAPPED)) != 0
     exchanged &= (status & _HARDLY_CHANGES) != 0
-    sound = ((status & _BROKEN) == 0) & ~exchanged
+    sound = ((status & BROKEN) == 0) & ~exchanged
     return replace(result, survey=solution.survey(sound, status == 0))
 
 
@@ -220,36 +238,10 @@ def _flags(tile: Tile, solution: Solution) -> dict[Status, Mask]:
     }
 
 
-def _followed(tile: Tile, settings: SubspaceSettings) -> Estimate:
-    """All steps: a pixel keeps its division of the time from a pass before, unless it fails."""
-    functions, kept = _functions(tile), tile.division
-    places = np.flatnonzero(() if kept is None else kept.any(axis=0))
-    if kept is None or places.size == 0:
-        return _searched(tile, functions, settings)
-    chosen, first = tile.select_pixels(places), kept[:, places]
-    estimate = _report(chosen, _divided(chosen, first, functions, settings))
-    sound = estimate.status == 0
-    estimate = _finished(chosen, estimate, first, functions)
-    # A flag asks for the search.
-    searched = np.ones(kept.shape[1], dtype=bool)
-    searched[places[sound]] = False
-    if not searched.any():
-        return estimate
-    if 2 * np.count_nonzero(searched) > searched.size:  # to select most of a tile takes longer
-        result = _searched(tile, functions, settings)
-    else:
-        result = _searched(tile.select_pixels(searched), functions, settings)
-        result = result.select_pixels(np.maximum(np.cumsum(searched) - 1, 0))
-    if result.division is None:
-        result = replace(result, division=np.zeros_like(kept))
-    result.replace_pixels(places[sound], estimate.select_pixels(sound))
-    return result
-
-
-def _searched(tile: Tile, functions: smooth.Subspace, settings: SubspaceSettings) -> Estimate:
+def _searched(tile: Tile, functions: smooth.Subspace, drift: float) -> Estimate:
     """All steps: pixels that do not fit are solved anew with polynomials in pieces of the time."""
     noise = np.array(tile.noise)
-    solution = fused.solve(tile, functions, settings.background_drift)
+    solution = fused.solve(tile, functions, drift)
     used = solution.order + functions.steps
     asked = pieces.asked(solution.sums, tile.time, solution.null_variance, used)
     asked |= solution.order > functions.orders - _LAST
@@ -281,7 +273,8 @@ def _searched(tile: Tile, functions: smooth.Subspace, settings: SubspaceSettings
         if places.size == 0:
             continue
         chosen = suspects.select_pixels(places)
-        resolved = _report(chosen, _divided(chosen, divided[:, places], functions, settings))
+        parts = _parts(chosen, divided[:, places], functions)
+        resolved = _report(chosen, fused.solve(chosen, functions, drift, parts))
         cheaper = price[places] < cost[places] - _LIKELY
         better = (resolved.status == 0) | (flagged[places] & cheaper)
         places, resolved = places[better], resolved.select_pixels(better)
@@ -337,13 +330,6 @@ def _parts(
     for places in map(np.array, alike.values()):
         begins = tile.time, first[:, places[0]], functions.rising
         yield places, smooth.piecewise(*begins, segment=tile.segment, number=number)
-
-
-def _divided(
-    tile: Tile, first: Mask, functions: smooth.Subspace, settings: SubspaceSettings
-) -> Solution:
-    """Solution with pieces that begin with some frames (time, pixel), same pieces together."""
-    return fused.solve(tile, functions, settings.background_drift, _parts(tile, first, functions))
 
 
 METHOD: Final = Method(

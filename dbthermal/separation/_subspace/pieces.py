@@ -146,19 +146,12 @@ def null_energy(white: Array, functions: smooth.Subspace, axis: Array) -> tuple[
     principal = 0.5 * (a + d) - np.sqrt(0.25 * (a - d) ** 2 + b * b)
     pooled = axis[1] ** 2 * a - 2.0 * axis[0] * axis[1] * b + axis[0] ** 2 * d
     energy = np.where(np.isnan(pooled), principal, pooled)
-    order = _order(energy, white.shape[1])
-    used = order + 1 + functions.steps
-    return energy[order, np.arange(order.size)], used
-
-
-def _order(null_energy: Array, frames: int) -> Whole:
-    """Order less one (pixel) of the lowest information criterion of an energy (order, pixel)."""
-    if len(null_energy) == 1:
-        return np.zeros(null_energy.shape[1], dtype=np.intp)
-    criterion = frames * np.log(np.maximum(null_energy, reflection_ratio.TINY))
-    criterion += np.arange(1, len(null_energy) + 1)[:, np.newaxis] * np.log(frames)
-    lowest = min(reflection_ratio.LOWEST_ORDER, null_energy.shape[0] - 1) - 1
-    return np.asarray(lowest + np.argmin(criterion[lowest:-1], axis=0) + 1)
+    frames, orders = white.shape[1], len(energy)
+    criterion = frames * np.log(np.maximum(energy, reflection_ratio.TINY))
+    criterion += np.arange(1, orders + 1)[:, np.newaxis] * np.log(frames)
+    lowest = min(reflection_ratio.LOWEST_ORDER, orders - 1)
+    order = lowest + np.argmin(criterion[lowest - 1 : -1], axis=0)
+    return energy[order, np.arange(order.size)], order + 1 + functions.steps
 
 
 def returning(signal: Array) -> Mask:
@@ -203,10 +196,9 @@ def check_clock(signals: Array, time: Array, noise: Array, segment: Whole | None
     """
     frames, white = time.size, plane(signals, noise)[0]
     any_axis = np.full((2, white.shape[2]), np.nan)
-    order = min(reflection_ratio.HIGHEST_ORDER, frames // 4)
     chi2 = []
     for clock in (time, np.arange(frames, dtype=np.float64)):
-        functions = smooth.subspace(clock, order, segment=segment)
+        functions = reflection_ratio.smooth_functions(clock, segment)
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             energy, used = null_energy(white, functions, any_axis)
             chi2.append(energy / (frames - used))

@@ -1,6 +1,5 @@
 """Robust regression, which finds a line beside outliers on one side; of one pixel, compiled."""
 
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -71,52 +70,45 @@ def bisquare(off: float) -> float:
     return inside * inside
 
 
-def _of(real: type[np.float32] | type[np.float64]) -> tuple[Any, Any]:
-    """Weighted line, and that of bisquare weights, of arrays of a precision, compiled."""
-    zero, one = real(0.0), real(1.0)
-
-    @compiled
-    def moments(x: Any, y: Any, weights: Any) -> Any:
-        """Slope and intercept of a weighted line, and the energy of the abscissa about its mean."""
-        total, first, second, square, product = zero, zero, zero, zero, zero
-        for t in range(x.size):
-            w = weights[t]
-            wx = w * x[t]
-            total += w
-            first += wx
-            second += w * y[t]
-            square += wx * x[t]
-            product += wx * y[t]
-        middle, centre = first / total, second / total
-        energy = square - total * middle * middle
-        slope = (product - total * middle * centre) / energy
-        return slope, centre - slope * middle, energy
-
-    @compiled
-    def reweighted(x: Any, y: Any, slope: Any, intercept: Any, scale: float) -> Any:
-        """As `moments`, with Tukey's bisquare weights of the residuals of another line."""
-        inverse = real(1.0 / (TUNING * scale))
-        total, first, second, square, product = zero, zero, zero, zero, zero
-        for t in range(x.size):
-            r = (y[t] - intercept - slope * x[t]) * inverse
-            kept = max(one - r * r, zero)
-            w = kept * kept
-            wx = w * x[t]
-            total += w
-            first += wx
-            second += w * y[t]
-            square += wx * x[t]
-            product += wx * y[t]
-        middle, centre = first / total, second / total
-        energy = square - total * middle * middle
-        slope = (product - total * middle * centre) / energy
-        return slope, centre - slope * middle, energy
-
-    return moments, reweighted
+@compiled
+def moments(x: Any, y: Any, weights: Any) -> Any:
+    """Slope and intercept of a weighted line, and the energy of the abscissa about its mean."""
+    zero = x.dtype.type(0.0)  # all in the precision of the points
+    total, first, second, square, product = zero, zero, zero, zero, zero
+    for t in range(x.size):
+        w = weights[t]
+        wx = w * x[t]
+        total += w
+        first += wx
+        second += w * y[t]
+        square += wx * x[t]
+        product += wx * y[t]
+    middle, centre = first / total, second / total
+    energy = square - total * middle * middle
+    slope = (product - total * middle * centre) / energy
+    return slope, centre - slope * middle, energy
 
 
-moments, reweighted = _of(np.float64)
-_moments, _reweighted = _of(np.float32)
+@compiled
+def reweighted(x: Any, y: Any, slope: Any, intercept: Any, scale: float) -> Any:
+    """As `moments`, with Tukey's bisquare weights of the residuals of another line."""
+    real = x.dtype.type
+    zero, one, inverse = real(0.0), real(1.0), real(1.0 / (TUNING * scale))
+    total, first, second, square, product = zero, zero, zero, zero, zero
+    for t in range(x.size):
+        r = (y[t] - intercept - slope * x[t]) * inverse
+        kept = max(one - r * r, zero)
+        w = kept * kept
+        wx = w * x[t]
+        total += w
+        first += wx
+        second += w * y[t]
+        square += wx * x[t]
+        product += wx * y[t]
+    middle, centre = first / total, second / total
+    energy = square - total * middle * middle
+    slope = (product - total * middle * centre) / energy
+    return slope, centre - slope * middle, energy
 
 
 @compiled
@@ -135,7 +127,7 @@ def _started(x: Array, y: Array, noise: float, few: Any) -> tuple[float, float]:
     for i in range(count):
         t = i if count == x.size else i * x.size // STARTING_POINTS
         xs[i], ys[i], weights[i] = x[t] - middle, y[t] - centre, 1.0
-    slope, intercept, _ = _moments(xs, ys, weights)
+    slope, intercept, _ = moments(xs, ys, weights)
     for i in range(count):
         plain[i] = ys[i] - intercept - slope * xs[i]
     rank, zero = int(SHARE * count), np.float32(0.0)
@@ -144,12 +136,12 @@ def _started(x: Array, y: Array, noise: float, few: Any) -> tuple[float, float]:
         sign = np.float32(2 * start - 3) if start > 0 else zero
         for i in range(count):
             weights[i] = 1.0 if sign * plain[i] >= zero else 0.0
-        slope, intercept, _ = _moments(xs, ys, weights)
+        slope, intercept, _ = moments(xs, ys, weights)
         deviation = 0.0
         for turn in range(STARTING_STEPS):
             if turn > 0:
                 scale = max(noise, ANNEALING * TO_STD * deviation)
-                slope, intercept, _ = _reweighted(xs, ys, slope, intercept, scale)
+                slope, intercept, _ = reweighted(xs, ys, slope, intercept, scale)
             total = zero
             for i in range(count):
                 magnitude[i] = abs(ys[i] - intercept - slope * xs[i])
@@ -205,38 +197,29 @@ def regress(
     return slope, scale**2 / energy / independent, scale, energy
 
 
-@dataclass(frozen=True)
-class Lines:
-    """Straight lines through each pixel's points."""
+def lines(abscissa: Array, ordinate: Any, noise: float) -> tuple[Array, Array, Array, Array]:
+    """Robust lines of an ordinate z on an abscissa (time, pixel), see `regress`.
 
-    slope: Array  # (pixel)
-    variance: Array  # of the slope, with the residuals' correlation in time (pixel)
-    energy: Array  # weighted sum of squares of the abscissa about its mean (pixel)
-    weights: Array  # in [0, 1] (time, pixel)
-
-    def kernel(self, abscissa: Array) -> Array:
-        """Weights k (time, pixel) of the ordinate z in the slope, sum k z."""
-        kernel = self.weights * abscissa
-        kernel -= self.weights * (kernel.sum(axis=0) / self.weights.sum(axis=0))
-        return np.asarray(kernel / self.energy)
-
-
-def lines(abscissa: Array, ordinate: Array, noise: float) -> Lines:
-    """Robust lines of an ordinate on an abscissa (time, pixel), see `regress`."""
+    Slopes, their variances and energies of the abscissa (pixel), and the weights k (time, pixel) of
+    the ordinate in the slope, sum k z.
+    """
     frames, pixels = abscissa.shape
     rows = [np.ascontiguousarray(values.T, np.float64) for values in (abscissa, ordinate)]
-    weights, numbers = np.empty((pixels, frames)), np.empty((pixels, 3 + frames))
-    few = np.full((5, frames), np.inf, np.float32)
-    _lines(*rows, float(noise), weights, few, numbers)
-    slope, variance, energy = numbers[:, :3].T
-    return Lines(slope, variance, energy, weights.T)
+    weights, numbers = np.empty((pixels, frames)), np.empty((3, pixels))
+    work = np.empty(frames), np.full((5, frames), np.inf, np.float32)
+    _lines(*rows, float(noise), weights, *work, numbers)
+    slope, variance, energy = numbers
+    kernel = weights.T * abscissa
+    kernel -= weights.T * (kernel.sum(axis=0) / weights.T.sum(axis=0))
+    return slope, variance, energy, kernel / energy
 
 
 @kernels.entered
-def _lines(x: Array, y: Array, noise: float, weights: Array, few: Any, numbers: Array) -> None:
+def _lines(
+    x: Array, y: Array, noise: float, weights: Array, residual: Array, few: Any, numbers: Array
+) -> None:
     """As `regress`, of many pixels (pixel, time), without a start; in place."""
     for p in range(len(x)):
-        slope, variance, _, energy = regress(
-            x[p], y[p], noise, weights[p], numbers[p, 3:], few, False
+        numbers[0, p], numbers[1, p], _, numbers[2, p] = regress(
+            x[p], y[p], noise, weights[p], residual, few, False
         )
-        numbers[p, 0], numbers[p, 1], numbers[p, 2] = slope, variance, energy
