@@ -49,7 +49,7 @@ class _Pair:
     """Two bands on one clock of even steps."""
 
     signals: Array  # counts (2, time, pixel) [count], NaN in missing frames
-    segments: clocks.Indices  # number of shutter events before each frame (2, time)
+    segments: smooth.Whole  # number of shutter events before each frame (2, time)
     times: Array  # (time) [s]
 
     def shifted(self, lag: int) -> "_Pair":
@@ -260,7 +260,7 @@ def present(frames: npt.NDArray[Any]) -> Mask:
     return np.asarray(~np.isnan(frames[:, 0]))
 
 
-def _on_one_clock(signals: Array, stamps: Array, segment: clocks.Indices, reach: int) -> _Pair:
+def _on_one_clock(signals: Array, stamps: Array, segment: smooth.Whole, reach: int) -> _Pair:
     """Both bands at evenly spaced times, interpolated where they are not already."""
     times = clocks.even_times(stamps, reach)
     if stamps.shape[1] == times.size and np.all(stamps == times):
@@ -309,7 +309,7 @@ def _common(shared: _Pair, names: list[str]) -> Mask:
     return np.asarray(common)
 
 
-def _rapid(movie: Array, times: Array, valid: Mask, segment: clocks.Indices) -> Array:
+def _rapid(movie: Array, times: Array, valid: Mask, segment: smooth.Whole) -> Array:
     """Residual of a signal (time, pixel) on smooth functions and steps; 0 in invalid frames."""
     steps = segment[valid][:, np.newaxis] == np.unique(segment[valid])[1:]
     functions, _ = np.linalg.qr(np.hstack([smooth.polynomial_basis(times[valid], _ORDER), steps]))

@@ -21,6 +21,7 @@ import xarray as xr
 from scipy.ndimage import uniform_filter
 
 from dbthermal import _smooth as smooth
+from dbthermal import schema
 from dbthermal._arrays import Array, Mask, quotient, release
 from dbthermal._compiled import compiled
 from dbthermal.separation import _tiles as tiles
@@ -157,9 +158,8 @@ def _leak(blocks: _Blocks) -> Array:
     strong = energy > _MOVING * freedom * reflection
     energy = np.where(strong, energy, 0.0)
     share = quotient(cross, energy, 0.0)
-    variance = quotient(
-        remainder * (energy + freedom * reflection) / _number(blocks), energy**2, 0.0
-    )
+    noise = remainder * (energy + freedom * reflection) / _number(blocks)
+    variance = quotient(noise, energy**2, 0.0)
     # Scatter of the events about their mean, less noise, by the weight of each.
     total = energy.sum(axis=0)
     weight = quotient(energy, total + 0.0 * energy, 0.0)
@@ -185,7 +185,10 @@ def _of_rows(inputs: Inputs, result: xr.Dataset, reading: Reading) -> _Blocks:
     weights, noise = _weights(
         np.where(pixels, ratio, 0.5), inputs.noise[inputs.bands, np.newaxis] * gain
     )
-    span, event = _spans(frames)
+    # A span of time is an octave beyond the smooth functions, half of an event.
+    length = _length(frames.size)
+    event, half = np.divmod(np.flatnonzero(frames), length)
+    span = np.unique(2 * event + (2 * half >= length), return_inverse=True)[1]
     remainder, reflection = np.zeros((2, signals.shape[1], number.size))
     _average(signals[0], reflections, weights, place, remainder, reflection)
     single = _single_pixels(inputs, signals, weights, frames, place, column, number.size)
@@ -200,13 +203,13 @@ def _of_rows(inputs: Inputs, result: xr.Dataset, reading: Reading) -> _Blocks:
     )
     stated = _stated(inputs, result, rows, pixels)
     stated = np.bincount(place[pixels], stated[pixels], number.size) / filled
-    factor = inputs.capture.get("noise_factor", np.ones(1))
-    if inputs.displacement is not None or np.any(factor < 1.0):  # neighbours share noise
+    resampled = np.any(schema.noise_factor(inputs.capture) < 1.0)
+    if inputs.displacement is not None or resampled:  # neighbours share noise
         jumps = np.diff(remainder, 2, axis=0)
         noise[0] = np.maximum(noise[0], np.mean(jumps**2, axis=0) / 6.0)
     means = np.eye(span[-1] + 1)[span].T / np.bincount(span)[:, np.newaxis]
     leverage = np.mean(np.sum(means**2, axis=1) - np.sum((means @ basis) ** 2, axis=1))
-    events = np.eye(inputs.capture.sizes["time"] // _length(len(frames)) + 1)[event].T
+    events = np.eye(frames.size // length + 1)[event].T
     freedom = np.outer(events @ (1.0 - np.sum(basis**2, axis=1)), np.ones(number.size))
     averages: tuple[Array, ...] = (
         np.where(number < 0.5 * _BLOCK**2, 0.0, number),
@@ -236,9 +239,7 @@ def _single_pixels(
     middle = np.flatnonzero(column[:-1] % _BLOCK == 1)
     alike = (place[middle - 1] == place[middle]) & (place[middle] == place[middle + 1])
     middle = middle[alike & (place[middle] >= 0)]
-    segment = np.zeros(signals.shape[1], dtype=np.intp)
-    if "segment" in inputs.capture:
-        segment = inputs.capture["segment"].values[frames].astype(np.intp)
+    segment = schema.segments(inputs.capture)[frames]
     squares = _compare(signals, weights, middle, segment, _length(len(frames)) // 2)
     sums = np.stack([np.bincount(place[middle], values, blocks) for values in squares])
     return np.asarray(sums / np.maximum(np.bincount(place[middle], minlength=blocks), 1.0))
@@ -322,7 +323,7 @@ def _subtract(
 def smooth_functions(inputs: Inputs, frames: Mask) -> Array:
     """Smooth functions (frame, number), and steps of shutter events, over some frames (time)."""
     time = inputs.capture["time"].values[frames].astype(np.float64)
-    segment = inputs.capture["segment"].values[frames] if "segment" in inputs.capture else None
+    segment = schema.segments(inputs.capture)[frames]
     order = min(HIGHEST_ORDER, time.size // 4)
     return smooth.subspace(time, order, segment=segment).functions
 
@@ -342,13 +343,6 @@ def _length(frames: int) -> int:
     return frames // min(HIGHEST_ORDER, frames // 4)
 
 
-def _spans(frames: Mask) -> tuple[Whole, Whole]:
-    """Span of each of some frames (time), an octave beyond the smooth functions, and its event."""
-    event, half = np.divmod(np.flatnonzero(frames), _length(frames.size))
-    spans = 2 * event + (2 * half >= _length(frames.size))
-    return np.unique(spans, return_inverse=True)[1], event
-
-
 def _weights(ratio: Array, deviation: Array) -> tuple[Array, Array]:
     """Weights (band, pixel) of the bands for the object's signal, at the least noise.
 
@@ -358,12 +352,8 @@ def _weights(ratio: Array, deviation: Array) -> tuple[Array, Array]:
     weights = contrast / ((deviation[1:] / ratio[1:]) ** 2 + deviation[0] ** 2)
     weights /= np.sum(weights * contrast, axis=0)
     every = np.concatenate([-weights.sum(axis=0, keepdims=True), weights / ratio[1:]])
-    noise = (
-        np.sum((every * deviation) ** 2, axis=0),
-        deviation[0] ** 2,
-        every[0] * deviation[0] ** 2,
-    )
-    return every, np.stack(noise)
+    total, first = np.sum((every * deviation) ** 2, axis=0), deviation[0] ** 2
+    return every, np.stack([total, first, every[0] * first])
 
 
 @compiled

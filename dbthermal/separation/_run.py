@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 import xarray as xr
 from tqdm import tqdm
 
-from dbthermal import _numbers, store
+from dbthermal import _numbers, schema, store
 from dbthermal import _text as texts
 from dbthermal.separation import _inputs
 from dbthermal.separation._inputs import BLOCK_ROWS, Method
@@ -121,10 +121,7 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
         raise ValueError(f"Unknown method {method!r} of a run. Must be one of {list(METHODS)}.")
     require_seed(seed)
     memory = _numbers.real_number("memory [byte]", memory, _numbers.POSITIVE)
-    if not isinstance(provenance, Mapping):
-        raise TypeError(
-            f"Invalid provenance of type {type(provenance).__name__}. Must be a mapping."
-        )
+    schema.require(provenance, Mapping, "provenance")
     options: dict[str, Any] = {"settings": settings, "mask": mask, "seed": seed}
     options |= {"emissivity": emissivity, "emissivity_std": emissivity_std}
     options |= {"emissivity_covariance": emissivity_covariance, "response_kind": response_kind}

@@ -29,7 +29,6 @@ Whole = npt.NDArray[np.intp]
 Mask = npt.NDArray[np.bool_]
 Window = tuple[slice, slice]
 """Rows and columns of a tile in the image."""
-Loader = Callable[[], tuple[xr.Dataset, list[Grain]]]
 
 KEPT_ATTRS: Final = ("origin", "radiometric", "source", "twin")
 """Attributes of a capture that its result has, too."""
@@ -59,7 +58,6 @@ class Pixels:
     """A record of arrays and records, optional ones among them, whose last axis is the pixel."""
 
     def select_pixels(self, selected: Mask | Whole) -> Self:
-        """Return the record of the selected pixels alone."""
         arrays: dict[str, Any] = {}
         for name, value in vars(self).items():
             within = value.select_pixels(selected) if isinstance(value, Pixels) else value
@@ -142,16 +140,13 @@ class Tile:
 
     def mixed(self, emissivity: Array, temperatures: Array) -> Array:
         """Signals (band, time, pixel) [K] of object and background (2, time, pixel) [K]."""
-        x, y = temperatures
-        return np.stack(
-            [
-                mixing.mixed(share, self.blackbody(band, x), self.blackbody(band, y))
-                for band, share in enumerate(emissivity)
-            ]
-        )
+        signals = []
+        for band, share in enumerate(emissivity):
+            emitted, reflected = (self.blackbody(band, film) for film in temperatures)
+            signals.append(mixing.mixed(share, emitted, reflected))
+        return np.stack(signals)
 
     def select_frames(self, selected: Mask) -> "Tile":
-        """Return the tile with the selected frames (time) alone."""
         segment = None if self.segment is None else self.segment[selected]
         signals = select(self.signals, selected, axis=1)
         time = self.time[selected]
@@ -200,13 +195,12 @@ class Estimate(Pixels):
         value = std if emissivity is None else emissivity
         return cls(object_temperature, missing, background, missing, value, std, status)
 
-    def undefine(self, no_object: Mask, no_emissivity: Mask, no_background: Mask) -> "Estimate":
-        """Set quantities and their standard deviations to NaN in some pixels (pixel) each."""
-        where = {"object": no_object, "emissivity": no_emissivity, "background": no_background}
+    def undefine(self, pixels: Mask) -> "Estimate":
+        """Set temperatures, emissivities and their deviations to NaN in some pixels (pixel)."""
         arrays: dict[str, Any] = {
-            name: np.where(where[name.split("_")[0]], np.nan, value)
+            name: np.where(pixels, np.nan, value)
             for name, value in vars(self).items()
-            if name.split("_")[0] in where and value is not None
+            if name.startswith(("object", "background", "emissivity")) and value is not None
         }
         return replace(self, **arrays)
 
@@ -236,15 +230,11 @@ class Estimate(Pixels):
             values[name] = np.where(lost, np.nan, value)
             values[f"{name}_std"] = np.where(lost, np.nan, std)
             if name.endswith("temperature"):
-                beyond |= np.any(out_of_range(value, std, curve), axis=0)
+                margin = RANGE_SIGMAS * np.nan_to_num(std, posinf=np.inf)
+                outside = (value < curve.lowest - margin) | (value > curve.highest + margin)
+                beyond |= np.any(outside, axis=0)
         status = self.status | status_bits({Status.OUTSIDE_RESPONSE: beyond})
         return replace(self, **values, status=status)
-
-
-def out_of_range(temperature: Array, std: Array, curve: Curve) -> Mask:
-    """Temperatures [K] outside the calibrated range of a response by several deviations."""
-    margin: Array = RANGE_SIGMAS * np.nan_to_num(std, posinf=np.inf)
-    return (temperature < curve.lowest - margin) | (temperature > curve.highest + margin)
 
 
 Section = tuple[Mask, Mask, Tile]  # frames (time), pixels (pixel), and the tile of these
@@ -261,7 +251,7 @@ class Cut:
     parts: list[Section]
 
 
-def windows(rows: slice, width: int, pixels: int = PIXELS) -> Iterator[Window]:
+def windows(rows: slice, width: int, pixels: int) -> Iterator[Window]:
     """Yield windows of at most so many pixels that cover some rows of an image."""
     columns = min(width, pixels)
     height = max(1, pixels // columns)
@@ -291,11 +281,11 @@ def cut(
     Of all pixels, or of those of the image that are `wanted` (pixel).
     """
     displacement, method = inputs.displacement, inputs.method
-    load, source = _loader(inputs, rows)
+    sampled = _sampler(inputs, rows)
     width, frames = inputs.capture.sizes["x"], inputs.capture.sizes["time"]
     most = largest(method, inputs.settings, inputs.capture)
     size = most if displacement is None else max(width, _TOGETHER // frames)
-    size = (source.stop - source.start) * width if method.whole_image else size
+    size = (rows.stop - rows.start) * width if method.whole_image else size
     # Read each window, judge its samples, and group its pixels by their valid frames.
     for window in windows(rows, width, size):
         places = numbers(window, width)
@@ -303,7 +293,7 @@ def cut(
         places = places[selected]
         if places.size == 0:
             continue
-        counts, usable, valid, status, gain = _sampled(inputs, load, source, window, selected)
+        counts, usable, valid, status, gain = sampled(window, selected)
         if method.whole_image or method.every_frame:
             sets = quality.common_frames(counts, usable, status, method.minimum_frames)
         else:
@@ -323,10 +313,10 @@ def cut(
             whole = method.whole_image or np.all(pixels)
             section = tile if whole else tile.select_pixels(pixels)
             section = section if np.all(used) else section.select_frames(used)
-            groups = iter([(used, pixels, section)])
-            if displacement is not None:
-                groups = of_one_noise(used, pixels, section, gain, most)
-            sections.extend(groups)
+            if displacement is None:
+                sections.append((used, pixels, section))
+            else:
+                sections.extend(of_one_noise(used, pixels, section, gain, most))
         yield Cut(window, places, status, valid, sections)
 
 
@@ -337,8 +327,7 @@ def read(inputs: Inputs, rows: slice) -> tuple[Array, Mask, Mask, Array]:
     noise (band, pixel) over that of a sample.
     """
     window = rows, slice(0, inputs.capture.sizes["x"])
-    load, source = _loader(inputs, rows)
-    counts, usable, _, status, gain = _sampled(inputs, load, source, window, slice(None))
+    counts, usable, _, status, gain = _sampler(inputs, rows)(window, slice(None))
     sets = quality.common_frames(counts, usable, status, inputs.method.minimum_frames)
     frames, pixels = sets[0] if sets else (np.ones(len(usable), dtype=bool), status < 0)
     signals = _tile(inputs, counts, window, slice(None)).signals
@@ -346,9 +335,10 @@ def read(inputs: Inputs, rows: slice) -> tuple[Array, Mask, Mask, Array]:
     return signals, frames, pixels, gain[[0] + [1] * (len(signals) - 1)]
 
 
-def _loader(inputs: Inputs, rows: slice) -> tuple[Loader, slice]:
-    """Loader of the rows that show some rows, with the grains of their bands; and those rows."""
-    source = rows if inputs.displacement is None else inputs.displacement.source(rows)
+def _sampler(inputs: Inputs, rows: slice) -> Callable[[Window, slice | Whole], displaced.Paired]:
+    """Function that reads some pixels of a window of the rows, as `displaced.paired`."""
+    displacement, fewest = inputs.displacement, inputs.method.minimum_frames
+    source = rows if displacement is None else displacement.source(rows)
     slopes = np.array([curve.reference_slope for curve in inputs.curves])
 
     @cache  # and never read where all that is wanted of it is kept
@@ -356,26 +346,21 @@ def _loader(inputs: Inputs, rows: slice) -> tuple[Loader, slice]:
         block = inputs.capture.isel(y=source).load()
         return block, quality.grains(block, inputs.noise * slopes)
 
-    return load, source
+    def sampled(window: Window, selected: slice | Whole) -> displaced.Paired:
+        if displacement is not None:
+            return displaced.paired(load, displacement, window[0], source, selected, fewest)
+        block, grains = load()
+        lines = slice(window[0].start - rows.start, window[0].stop - rows.start)
+        view = block.isel(y=lines, x=window[1])
+        if not isinstance(selected, slice):  # as one row
+            places = np.divmod(selected[np.newaxis], view.sizes["x"])
+            y, x = (xr.DataArray(place, dims=("y", "x")) for place in places)
+            view = view.drop_vars(("y", "x"), errors="ignore").isel(y=y, x=x)
+        counts, valid, status = quality.read(view, fewest, grains)
+        counts, usable = quality.bridge(counts, valid, view["time"].values.astype(np.float64))
+        return counts, usable, valid, status, np.ones((2, status.size))
 
-
-def _sampled(
-    inputs: Inputs, load: Loader, source: slice, window: Window, selected: slice | Whole
-) -> displaced.Paired:
-    """Samples of some pixels of a window of the source, as `displaced.paired`."""
-    displacement, fewest = inputs.displacement, inputs.method.minimum_frames
-    if displacement is not None:
-        return displaced.paired(load, displacement, window[0], source, selected, fewest)
-    block, grains = load()
-    rows = slice(window[0].start - source.start, window[0].stop - source.start)
-    view = block.isel(y=rows, x=window[1])
-    if not isinstance(selected, slice):  # as one row
-        places = np.divmod(selected[np.newaxis], view.sizes["x"])
-        y, x = (xr.DataArray(place, dims=("y", "x")) for place in places)
-        view = view.drop_vars(("y", "x"), errors="ignore").isel(y=y, x=x)
-    counts, valid, status = quality.read(view, fewest, grains)
-    counts, usable = quality.bridge(counts, valid, view["time"].values.astype(np.float64))
-    return counts, usable, valid, status, np.ones((2, status.size))
+    return sampled
 
 
 def _tile(inputs: Inputs, counts: Array, window: Window, selected: slice | Whole) -> Tile:

@@ -232,7 +232,7 @@ def _report(
         solution,
         **{name: np.full_like(getattr(solution, name), np.nan) for name in METHOD.not_estimated},
         status=solution.status | status_bits({Status.NOT_CONVERGED: unfinished}),
-    ).undefine(lost, lost, lost)
+    ).undefine(lost)
 
 
 METHOD: Final = Method(

@@ -91,9 +91,7 @@ def separate(tile: Tile, settings: NaiveSettings) -> Estimate:
     lost = ~np.isfinite(kept.objective)
     status = status_bits({Status.NOT_CONVERGED: kept.active | lost})
     estimate = Estimate.without_std(tile, temperature, status, emissivity, background)
-    return estimate.undefine(lost, lost, lost).check_range(
-        tile.curves[0], not_estimated=WITHOUT_STD
-    )
+    return estimate.undefine(lost).check_range(tile.curves[0], not_estimated=WITHOUT_STD)
 
 
 def _search(tile: Tile, settings: NaiveSettings) -> _State:
