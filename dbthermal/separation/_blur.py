@@ -70,7 +70,6 @@ def equalise(
     corrected: xr.Dataset, inputs: Inputs, result: xr.Dataset, misfit: Misfit
 ) -> Equalised | None:
     """Blur the sharper bands as much as the others, if they differ; None if not."""
-    sound = result["status"].values == 0
     excess = np.zeros(len(inputs.bands))
     for hints in misfit.answers[sharpness]:
         for place, (force, _, variance) in enumerate(hints, 1):
@@ -82,7 +81,7 @@ def equalise(
     # Blur what smooth functions of time do not hold: maps of their coefficients say what they do.
     counts = empty(corrected["counts"].shape, np.float32)
     factor = np.ones(excess.size)
-    square = np.zeros(sound.shape)
+    square = np.zeros(result["status"].shape)
     weights = misfits.object_weights(inputs, result)
     for band, film in enumerate(counts):
         film[:] = corrected["counts"].values[band]

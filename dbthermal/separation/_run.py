@@ -283,9 +283,8 @@ def _share(
 ) -> tuple[int, tuple[int, int], int]:
     """Threads of a process, rows and columns of a block, as `solve` reads or fewer, rows read."""
     counts, columns = capture["counts"], capture.sizes["x"]
-    column, lazy = counts[..., 0, 0].size, counts.chunksizes.get("y", ())
-    stored = counts.encoding.get("preferred_chunks", {})
-    chunks = counts.chunksizes
+    chunks, stored = counts.chunksizes, counts.encoding.get("preferred_chunks", {})
+    column, lazy = counts[..., 0, 0].size, chunks.get("y", ())
     chunk, chunk_width = (max(chunks.get(dim, ()), default=stored.get(dim, 1)) for dim in "yx")
     sample = _TILE if method.compiled else _TILE * _TIMES
     tile = sample * largest(method, settings, capture) * column
