@@ -12,7 +12,7 @@ HOUSE = Path(dbthermal.__file__).parent
 BUDGET = {
     "": (3480, 18),
     "_cli": (1226, 5),
-    "alignment": (2937, 13),
+    "alignment": (2919, 13),
     "calibration": (799, 3),
     "correction": (1779, 7),
     "emissivity": (448, 3),

@@ -36,9 +36,8 @@ KEPT_ATTRS: Final = ("origin", "radiometric", "source", "twin")
 PIXELS: Final = 320
 """Pixels in a tile, unless a method sets its own number."""
 
-SAMPLES: Final = 2**19
-"""Samples of a band in a tile, at most: with more, 30,000 frames take 1.3 times as long."""
-
+# Samples of a band in a tile, at most: with more, 30,000 frames take 1.3 times as long.
+_SAMPLES: Final = 2**19
 _COMPILED: Final = 8  # times as many pixels in a tile of a compiled method
 # Samples of a band that are resampled at once: few rows would mostly read those around them.
 _TOGETHER: Final = 2**23
@@ -148,8 +147,7 @@ class Tile:
 
     def select_frames(self, selected: Mask) -> "Tile":
         segment = None if self.segment is None else self.segment[selected]
-        signals = select(self.signals, selected, axis=1)
-        time = self.time[selected]
+        signals, time = select(self.signals, selected, axis=1), self.time[selected]
         return replace(self, signals=signals, time=time, segment=segment, division=None)
 
     def select_pixels(self, selected: Mask | Whole) -> "Tile":
@@ -194,15 +192,6 @@ class Estimate(Pixels):
         background = missing if background_temperature is None else background_temperature
         value = std if emissivity is None else emissivity
         return cls(object_temperature, missing, background, missing, value, std, status)
-
-    def undefine(self, pixels: Mask) -> "Estimate":
-        """Set temperatures, emissivities and their deviations to NaN in some pixels (pixel)."""
-        arrays: dict[str, Any] = {
-            name: np.where(pixels, np.nan, value)
-            for name, value in vars(self).items()
-            if name.startswith(("object", "background", "emissivity")) and value is not None
-        }
-        return replace(self, **arrays)
 
     def replace_scatter(self, order: int, selected: Mask, scatter: Array, frames: Array) -> None:
         """Replace a scatter of a sound survey, and its degrees of freedom (pixel), in place."""
@@ -263,14 +252,8 @@ def windows(rows: slice, width: int, pixels: int) -> Iterator[Window]:
 def largest(method: Method, settings: Any, capture: xr.Dataset) -> int:
     """Pixels in a tile of a capture, at most."""
     times = _COMPILED if method.compiled else 1
-    fitting = max(1, min(times * PIXELS, SAMPLES // capture.sizes["time"]))
+    fitting = max(1, min(times * PIXELS, _SAMPLES // capture.sizes["time"]))
     return int(getattr(settings, "batch", fitting))
-
-
-def numbers(window: Window, width: int) -> Whole:
-    """Numbers (pixel) of a window's pixels in an image of so many columns."""
-    lines = np.arange(window[0].start, window[0].stop)[:, np.newaxis] * width
-    return np.asarray((lines + np.arange(window[1].start, window[1].stop)).ravel())
 
 
 def cut(
@@ -288,7 +271,8 @@ def cut(
     size = (rows.stop - rows.start) * width if method.whole_image else size
     # Read each window, judge its samples, and group its pixels by their valid frames.
     for window in windows(rows, width, size):
-        places = numbers(window, width)
+        lines, columns = (np.arange(span.start, span.stop) for span in window)
+        places = np.add.outer(lines * width, columns).ravel()
         selected = slice(None) if wanted is None else np.flatnonzero(wanted[places])
         places = places[selected]
         if places.size == 0:

@@ -228,11 +228,13 @@ def _report(
         replace(tile, signals=signals, emissivity=emissivity, emissivity_covariance=None),
         calibrated.CalibratedSettings(smooth=False),
     )
+    measured = "object_temperature", "background_temperature", "emissivity"
     return replace(
         solution,
         **{name: np.full_like(getattr(solution, name), np.nan) for name in METHOD.not_estimated},
+        **{name: np.where(lost, np.nan, getattr(solution, name)) for name in measured},
         status=solution.status | status_bits({Status.NOT_CONVERGED: unfinished}),
-    ).undefine(lost)
+    )
 
 
 METHOD: Final = Method(
