@@ -73,7 +73,9 @@ def separate(tile: Tile, settings: CalibratedSettings) -> Estimate:
     values = [np.where(solved & ~gray, value, np.nan) for value in values]
     status = status_bits({Status.GRAY: gray, Status.OUTSIDE_RESPONSE: lost})
     std = np.sqrt(np.einsum("bbp->bp", covariance))
-    return Estimate(*values, e, std, status).check_range(tile.curves[0])
+    warm, warm_std, cold, cold_std = values
+    estimate = Estimate(warm, warm_std, cold, cold_std, e, std, status)
+    return estimate.check_range(tile.curves[0])
 
 
 def _gray(emissivity: Array, covariance: Array) -> Mask:
