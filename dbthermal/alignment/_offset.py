@@ -55,11 +55,9 @@ class _Pair:
     def shifted(self, lag: int) -> "_Pair":
         """Pair with the first band taken `lag` frames later."""
         frames = self.times.size - abs(lag)
-        late, early = max(lag, 0), max(-lag, 0)
-        signals, segments = (
-            np.stack([movie[0][late : late + frames], movie[1][early : early + frames]])
-            for movie in (self.signals, self.segments)
-        )
+        late, early = (slice(start, start + frames) for start in (max(lag, 0), max(-lag, 0)))
+        signals = np.stack([self.signals[0, late], self.signals[1, early]])
+        segments = np.stack([self.segments[0, late], self.segments[1, early]])
         return _Pair(signals, segments, self.times[:frames])
 
 

@@ -148,9 +148,8 @@ def _difference(inputs: Inputs, result: xr.Dataset, place: int) -> float:
     rows = every[:: max(1, len(every) // _BLOCKS)]
     for turn in range(_ROUNDS):
         readings = (misfits.reflected(inputs, result, block) for block in rows)
-        forces, form, variance = np.sum(
-            [_equations(inputs, result, place, excess, reading) for reading in readings], axis=0
-        )
+        sums = [_equations(inputs, result, place, excess, reading) for reading in readings]
+        forces, form, variance = np.sum(sums, axis=0)
         if form <= 0.0 or (turn == 0 and forces**2 < _SURE**2 * variance):
             return 0.0
         step = 2.0 * forces / form
@@ -201,10 +200,8 @@ def _equations(
     def rapid(film: Array) -> Array:
         return film - np.tensordot(basis, np.tensordot(basis.T, film, 1), 1)
 
-    first, second = (
-        np.stack([_details(image, blur) for image in films[order].reshape(-1, *shape)])
-        for order, blur in zip((0, place), blurs, strict=True)
-    )
+    first = np.stack([_details(image, blurs[0]) for image in films[0].reshape(-1, *shape)])
+    second = np.stack([_details(image, blurs[1]) for image in films[place].reshape(-1, *shape)])
     remainder, reflection = rapid(second / ratio - first), rapid(first)
     curvature = rapid(ndimage.laplace(first, axes=(1, 2)))
     # Noise in the products: that of the first band, in all three.
@@ -214,10 +211,9 @@ def _equations(
     point[point.shape[0] // 2, point.shape[1] // 2] = 1.0
     spread = _details(point, blurs[0])
     bent = ndimage.laplace(spread)
-    level, mixed, bending = (
-        free * levels[0] * np.sum(a * b)
-        for a, b in ((spread, spread), (spread, bent), (bent, bent))
-    )
+    level = free * levels[0] * np.sum(spread * spread)
+    mixed = free * levels[0] * np.sum(spread * bent)
+    bending = free * levels[0] * np.sum(bent * bent)
     products = (
         np.sum(remainder * reflection, axis=0) + level,
         np.sum(remainder * curvature, axis=0) + mixed,

@@ -151,9 +151,8 @@ def _single(blocks: _Blocks) -> Array:
 
 def _leak(blocks: _Blocks) -> Array:
     """Deviation (row, column) of the share of the reflection that is left, over the events."""
-    (cross, energy), (remainder, reflection, _) = (
-        _local_mean(blocks, values) for values in (blocks.products, blocks.noise)
-    )
+    cross, energy = _local_mean(blocks, blocks.products)
+    remainder, reflection, _ = _local_mean(blocks, blocks.noise)
     freedom = _local_mean(blocks, blocks.freedom)
     strong = energy > _MOVING * freedom * reflection
     energy = np.where(strong, energy, 0.0)
@@ -182,9 +181,8 @@ def _of_rows(inputs: Inputs, result: xr.Dataset, reading: Reading) -> _Blocks:
     place = np.where(pixels, row // _BLOCK * shape[1] + column // _BLOCK, -1)
     number = np.bincount(place[pixels], minlength=shape[0] * shape[1]).astype(np.float64)
     # Weigh the bands, and average what is left beside the object, and the reflection.
-    weights, noise = _weights(
-        np.where(pixels, ratio, 0.5), inputs.noise[inputs.bands, np.newaxis] * gain
-    )
+    deviation = inputs.noise[inputs.bands, np.newaxis] * gain
+    weights, noise = _weights(np.where(pixels, ratio, 0.5), deviation)
     # A span of time is an octave beyond the smooth functions, half of an event.
     length = _length(frames.size)
     event, half = np.divmod(np.flatnonzero(frames), length)
@@ -198,9 +196,9 @@ def _of_rows(inputs: Inputs, result: xr.Dataset, reading: Reading) -> _Blocks:
     noise = np.stack(summed) / filled**2
     # Take the smooth functions out, and sum over means and events.
     basis = smooth_functions(inputs, frames)
-    remainder, reflection = (
-        film - basis @ (basis.T @ film) for film in (remainder / filled, reflection / filled)
-    )
+    remainder, reflection = remainder / filled, reflection / filled
+    remainder -= basis @ (basis.T @ remainder)
+    reflection -= basis @ (basis.T @ reflection)
     stated = _stated(inputs, result, rows, pixels)
     stated = np.bincount(place[pixels], stated[pixels], number.size) / filled
     resampled = np.any(schema.noise_factor(inputs.capture) < 1.0)
@@ -271,9 +269,8 @@ def read(inputs: Inputs, result: xr.Dataset, rows: slice) -> tuple[Array, Mask, 
     pixels &= abs(weights) @ missing.ravel() == 0.0
     for order, band in enumerate(inputs.bands[1:], 1):
         curve = inputs.curves[band]
-        emitted = result["emissivity"].values[band, source] * (
-            curve.signal(np.where(missing, curve.reference, film)) - curve.reference
-        )
+        emitted = curve.signal(np.where(missing, curve.reference, film)) - curve.reference
+        emitted *= result["emissivity"].values[band, source]
         np.nan_to_num(emitted, copy=False)
         shown = (weights @ emitted.reshape(len(film), -1).T).T
         signals[order] -= shown - emitted[:, within].reshape(shown.shape)
@@ -432,9 +429,8 @@ def widen(inputs: Inputs, result: xr.Dataset, misfit: Misfit) -> None:
     for row in map(int, np.flatnonzero(sound.any(axis=1))):
         columns = np.flatnonzero(sound[row])
         chosen = [film[:, row, columns].astype(np.float64) for film in films]
-        leak, change, share = (
-            values[row, columns] for values in (misfit.leak, everything, emissivity)
-        )
+        leak, change = misfit.leak[row, columns], everything[row, columns]
+        share = emissivity[row, columns]
         counted = np.isfinite(chosen[0]).sum(axis=0)
         mean = quotient(np.nansum(chosen[0], axis=0), counted, curve.reference)
         slope = curve.slope(mean)
