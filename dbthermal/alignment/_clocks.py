@@ -10,8 +10,7 @@ import xarray as xr
 
 from dbthermal import _numbers, schema
 from dbthermal._arrays import Array, Mask
-
-Indices = npt.NDArray[np.intp]
+from dbthermal._smooth import Whole
 
 _COINCIDENT: Final = 0.01  # distance within which a sample is taken as it is [frame period]
 _GAP: Final = 1.5  # longest gap that is interpolated across [frame period]
@@ -34,8 +33,8 @@ class Interpolation:
     frames from crest to crest, the cubic 88.
     """
 
-    before: Indices  # frames (wanted)
-    after: Indices
+    before: Whole  # frames (wanted)
+    after: Whole
     weight: Array  # w (wanted) [1]
     bend: Array  # b (wanted, 4) [1]
     valid: Mask  # false across a gap or past an end (wanted)
@@ -92,7 +91,7 @@ class Interpolation:
         weights[:, 2] += self.weight
         return np.asarray((weights**2).sum(axis=1))
 
-    def labels(self, segment: Indices) -> Indices:
+    def labels(self, segment: Whole) -> Whole:
         """Segment (wanted) of each interpolated frame, from those of the samples (time)."""
         return np.where(self.weight == 1, segment[self.after], segment[self.before])
 
@@ -215,7 +214,7 @@ def pauses(times: Array) -> Array:
 
 
 def interpolation(
-    stamps: Array, present: Mask, wanted: Array, segment: Indices, growth: float
+    stamps: Array, present: Mask, wanted: Array, segment: Whole, growth: float
 ) -> Interpolation:
     """Interpolation of frames exposed at `stamps` (time) [s], at times `wanted` [s].
 

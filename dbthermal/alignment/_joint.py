@@ -136,10 +136,8 @@ def _compared(
     except ValueError:
         rival = None
     shift = np.inf if rival is None else np.nanmedian(np.hypot(*rival["shift"].values))
-    if rival is not None and shift < _SAME:
-        ahead = [np.diff(_explained(trial, rival)) > 0.0 for trial in tried]
-        if np.all(ahead):
-            return at_one_place
+    if rival is not None and shift < _SAME and all(_explains_more(rival, it) for it in tried):
+        return at_one_place
     frame = clocks.frame_period(stamps[0])
     if uncertainty <= _PRECISION * frame:
         return Comparison(offset, uncertainty, full_field)
@@ -151,11 +149,12 @@ def _compared(
     return Comparison(offset, uncertainty, full_field, (doubt,))
 
 
-def _explained(*fields: xr.Dataset) -> tuple[float, ...]:
-    """Share of the second camera's energy that each shift explains, in the pixels of all."""
-    common = np.all([field["known"].values for field in fields], axis=0)
-    sums = [field["energy"].values[:, common].sum(axis=1) for field in fields]
-    return tuple(float(explained / max(energy, 1e-9)) for explained, energy in sums)
+def _explains_more(rival: xr.Dataset, field: xr.Dataset) -> bool:
+    """A rival shift explains more of the second camera's energy, in the pixels of both."""
+    common = rival["known"].values & field["known"].values
+    sums = (shift["energy"].values[:, common].sum(axis=1) for shift in (rival, field))
+    shares = [explained / max(energy, 1e-9) for explained, energy in sums]
+    return bool(shares[0] > shares[1])
 
 
 def _clocked(
@@ -331,10 +330,8 @@ def _enlarged(field: xr.Dataset, aligned: xr.Dataset) -> xr.Dataset:
         return field
     # The centre of a square of n pixels is n - 1 half pixels from that of its first.
     places = (np.indices(shape) - 0.5 * (side - 1)) / side
-    squares = tuple(
-        np.clip(np.rint(place).astype(np.intp), 0, size - 1)
-        for place, size in zip(places, field["known"].shape, strict=True)
-    )
+    last = np.reshape(field["known"].shape, (2, 1, 1)) - 1
+    squares = tuple(np.minimum(np.indices(shape) // side, last))
     missing = np.isnan(field["shift"].values).any(axis=0)
     nearest = distance_transform_edt(missing, return_distances=False, return_indices=True)
     values = {"known": (field["known"].dims, field["known"].values[squares], field["known"].attrs)}

@@ -13,15 +13,9 @@ from scipy.ndimage import gaussian_filter
 
 from dbthermal import _smooth as smooth
 from dbthermal._arrays import Array, Mask
+from dbthermal.alignment import _products as images
 from dbthermal.alignment._field import Field, Information, Spline
-from dbthermal.alignment._products import (
-    Movie,
-    binned,
-    blurred,
-    normal_equations,
-    products,
-    splines,
-)
+from dbthermal.alignment._products import Movie
 from dbthermal.noise import MAD
 
 WINDOW: Final = 2.5
@@ -69,7 +63,7 @@ class Movies:
         whole: float,
     ) -> "Movies":
         """Movies of pixels that are so many times coarser than the mask's."""
-        mostly = binned(valid.astype(np.float64), factor) > 0.5
+        mostly = images.binned(valid.astype(np.float64), factor) > 0.5
         step = max(1, np.count_nonzero(mostly) // _NOISE_PIXELS)
         sample = tuple(index[::step] for index in np.nonzero(mostly))
         if sample[0].size:
@@ -77,8 +71,10 @@ class Movies:
             white = np.sqrt(freedom / movies[0].shape[2]) / factor
             usual = [MAD * np.median(np.abs(movie[sample])) for movie in movies]
             noise = np.minimum(noise, np.array(usual) / white)
-        films = splines(movies[0], BLUR), [blurred(movie, BLUR) for movie in movies[1:]]
-        return cls(*films, mostly, noise / factor, freedom, max(whole / freedom, 1.0), factor)
+        first = images.splines(movies[0], BLUR)
+        others = [images.blurred(movie, BLUR) for movie in movies[1:]]
+        outside = max(whole / freedom, 1.0)
+        return cls(first, others, mostly, noise / factor, freedom, outside, factor)
 
     def centres(self) -> list[Array]:
         """Rows and columns, of the capture, of the pixels' centres."""
@@ -103,9 +99,9 @@ def _whole_pixels(
         for movie in movies:
             pairs = padded[rows] @ movie.transpose(0, 2, 1)
             cross = np.stack([pairs.diagonal(-right, 1, 2) for right in range(gain.shape[2])], -1)
-            gain += np.maximum(blurred(cross, WINDOW), 0.0) ** 2
+            gain += np.maximum(images.blurred(cross, WINDOW), 0.0) ** 2
         shifted = [energies[0][rows, right : right + width] for right in range(gain.shape[2])]
-        gain /= np.maximum(blurred(np.stack(shifted, axis=-1), WINDOW), freedom)
+        gain /= np.maximum(images.blurred(np.stack(shifted, axis=-1), WINDOW), freedom)
         right, highest = gain.argmax(axis=2), gain.max(axis=2)
         better = highest > best
         best[better], where[0][better], where[1][better] = highest[better], down, right[better]
@@ -138,10 +134,10 @@ def _information(movies: Movies, shift: Array) -> Information:
     noise = movies.noise[0] * _VALUE_NOISE
     total = np.zeros((*used.shape, 6))
     number = np.maximum(gaussian_filter(used * movies.freedom, WINDOW), 1e-9)
-    moments = products(movies.first, movies.others, places) * used[..., np.newaxis]
+    moments = images.products(movies.first, movies.others, places) * used[..., np.newaxis]
     for sums, level in zip(moments, movies.noise[1:], strict=True):
         mm, my, mx, mh, yy, yx, yh, xx, xh, hh = np.moveaxis(sums, 2, 0)
-        auto, terms = np.moveaxis(blurred(sums[..., [0, 3]], WINDOW), 2, 0)
+        auto, terms = np.moveaxis(images.blurred(sums[..., [0, 3]], WINDOW), 2, 0)
         # Noise of the moved movie makes its energy larger, not its product with another movie.
         auto -= number * noise**2
         ratio = terms / np.maximum(auto, 0.1 * number * noise**2)
@@ -156,7 +152,7 @@ def _information(movies: Movies, shift: Array) -> Information:
         squares = ratio * yy - less, ratio * yx, ratio * xx - less
         terms = np.stack([*squares, yh - ratio * my, xh - ratio * mx, less], axis=-1)
         total += weight[..., np.newaxis] * terms
-    total = np.moveaxis(blurred(total, WINDOW), 2, 0)
+    total = np.moveaxis(images.blurred(total, WINDOW), 2, 0)
     tensor, gradient, less = total[:3], total[3:5], total[5]
     # With noise N in the slopes, var = (A + N) / A^2: as if the information were A^2 / (A + N).
     size = tensor[0] + tensor[2]
@@ -186,7 +182,7 @@ def start(movies: Movies, films: list[Movie], freedom: float, spline: Spline) ->
     pictures = []
     for film, level in zip(films, movies.noise, strict=True):
         # Changes as large as there are seldom are cut: an object's, if rapid.
-        picture = blurred(film, BLUR)
+        picture = images.blurred(film, BLUR)
         usual = np.quantile(np.abs(picture), _USUAL, axis=-1, keepdims=True)
         picture /= np.sqrt(1.0 + (picture / np.maximum(usual, 1e-12)) ** 2) * level * _VALUE_NOISE
         pictures.append(picture)
@@ -206,12 +202,12 @@ def start(movies: Movies, films: list[Movie], freedom: float, spline: Spline) ->
         )
     target, weight = rough * movies.factor, share / (_ROUGH * movies.factor) ** 2
     centres, zero = movies.centres(), np.zeros_like(share)
-    field = spline.fitted(Information(np.stack([weight, zero, weight]), weight * target), centres)
-    for _ in range(_ROBUST):
-        step = target - field.on(centres)
-        kept = weight / (1.0 + np.sum(step**2, axis=0) / movies.factor**2) ** 2
+    field, kept, step = None, weight, target
+    for _ in range(1 + _ROBUST):
         data = Information(np.stack([kept, zero, kept]), kept * step)
         field = spline.fitted(data, centres, field)
+        step = target - field.on(centres)
+        kept = weight / (1.0 + np.sum(step**2, axis=0) / movies.factor**2) ** 2
     return field
 
 
@@ -245,14 +241,14 @@ def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Arra
     """
     places = np.indices(movies.valid.shape) + shift / movies.factor
     used = inside(places, movies.valid) & movies.valid
-    sums = products(movies.first, movies.others, places, rate) * used[..., np.newaxis]
+    sums = images.products(movies.first, movies.others, places, rate) * used[..., np.newaxis]
     # Noise of the slopes and of the moved movie.
     number = gaussian_filter(used * movies.freedom, WINDOW)[..., np.newaxis] * movies.noise[0] ** 2
     less = number * np.square([_VALUE_NOISE, _SLOPE_NOISE, _SLOPE_NOISE, 0.0])
     totals = np.zeros((4, *movies.valid.shape))
     for array, level in zip(sums, movies.noise[1:], strict=True):
-        windows = blurred(array, WINDOW)
-        equations = normal_equations(windows, less)
+        windows = images.blurred(array, WINDOW)
+        equations = images.normal_equations(windows, less)
         # The shift of each window is eliminated.
         tensor, cross = equations[..., :2, :2], equations[..., :2, 2]
         ridge = _RIDGE * np.trace(tensor, axis1=-2, axis2=-1).max()

@@ -49,17 +49,15 @@ class _Pair:
     """Two bands on one clock of even steps."""
 
     signals: Array  # counts (2, time, pixel) [count], NaN in missing frames
-    segments: clocks.Indices  # number of shutter events before each frame (2, time)
+    segments: smooth.Whole  # number of shutter events before each frame (2, time)
     times: Array  # (time) [s]
 
     def shifted(self, lag: int) -> "_Pair":
         """Pair with the first band taken `lag` frames later."""
         frames = self.times.size - abs(lag)
-        late, early = max(lag, 0), max(-lag, 0)
-        signals, segments = (
-            np.stack([movie[0][late : late + frames], movie[1][early : early + frames]])
-            for movie in (self.signals, self.segments)
-        )
+        late, early = (slice(start, start + frames) for start in (max(lag, 0), max(-lag, 0)))
+        signals = np.stack([self.signals[0, late], self.signals[1, early]])
+        segments = np.stack([self.segments[0, late], self.segments[1, early]])
         return _Pair(signals, segments, self.times[:frames])
 
 
@@ -260,7 +258,7 @@ def present(frames: npt.NDArray[Any]) -> Mask:
     return np.asarray(~np.isnan(frames[:, 0]))
 
 
-def _on_one_clock(signals: Array, stamps: Array, segment: clocks.Indices, reach: int) -> _Pair:
+def _on_one_clock(signals: Array, stamps: Array, segment: smooth.Whole, reach: int) -> _Pair:
     """Both bands at evenly spaced times, interpolated where they are not already."""
     times = clocks.even_times(stamps, reach)
     if stamps.shape[1] == times.size and np.all(stamps == times):
@@ -309,7 +307,7 @@ def _common(shared: _Pair, names: list[str]) -> Mask:
     return np.asarray(common)
 
 
-def _rapid(movie: Array, times: Array, valid: Mask, segment: clocks.Indices) -> Array:
+def _rapid(movie: Array, times: Array, valid: Mask, segment: smooth.Whole) -> Array:
     """Residual of a signal (time, pixel) on smooth functions and steps; 0 in invalid frames."""
     steps = segment[valid][:, np.newaxis] == np.unique(segment[valid])[1:]
     functions, _ = np.linalg.qr(np.hstack([smooth.polynomial_basis(times[valid], _ORDER), steps]))

@@ -21,15 +21,9 @@ from dbthermal import response as responses
 from dbthermal import schema
 from dbthermal._arrays import Array, Mask, stride
 from dbthermal.alignment import _clocks as clocks
+from dbthermal.alignment import _products as images
 from dbthermal.alignment._offset import noise_levels, sample
-from dbthermal.alignment._products import (
-    Movie,
-    binned,
-    blurred,
-    normal_equations,
-    products,
-    splines,
-)
+from dbthermal.alignment._products import Movie
 
 SMALLEST: Final = 24
 """Rows and columns of an image whose bands are matched, at least."""
@@ -100,7 +94,6 @@ class Capture:
 
     @classmethod
     def of(cls, corrected: xr.Dataset, scale: Scale) -> "Capture":
-        """Check a capture."""
         counts = schema.check_corrected(corrected)["counts"]
         names = [str(name) for name in counts["band"].values]
         if len(names) < 2:
@@ -171,12 +164,12 @@ class Capture:
         for rows, films, complete in self.blocks(max(1, _ROWS // factor) * factor):
             valid[rows] &= complete
             used = valid[rows, :, np.newaxis]
-            share = np.maximum(binned(used.astype(np.float64), factor), factor**-2)
+            share = np.maximum(images.binned(used.astype(np.float64), factor), factor**-2)
             signals = [np.moveaxis(film, 0, -1) for film in films]
             if not used.all():
                 signals = [np.where(used, signal, np.float32(0.0)) for signal in signals]
             scale = (self.slopes[:, None, None, None] * share).astype(np.float32)
-            blocks.append(np.stack([binned(signal, factor) for signal in signals]) / scale)
+            blocks.append(np.stack([images.binned(signal, factor) for signal in signals]) / scale)
         return list(np.concatenate(blocks, axis=1)), valid
 
 
@@ -324,8 +317,8 @@ def _window_equations(corrected: xr.Dataset, scale: Scale) -> list[Array]:
         places = np.indices(film.shape[2:]).astype(np.float64)
         for block, function, rate in zip(sums, functions, rates, strict=True):
             planes = np.tensordot(film, function.astype(np.float32), (1, 0))
-            first, second = splines(planes[0], _BLUR), blurred(planes[1], _BLUR)
-            pairs = products(first, [second], places, rate.astype(np.float32))[0].sum(axis=0)
+            first, second = images.splines(planes[0], _BLUR), images.blurred(planes[1], _BLUR)
+            pairs = images.products(first, [second], places, rate.astype(np.float32))[0].sum(axis=0)
             within = (slice(left, left + side) for left in lefts - columns.start)
             block.extend(pairs[window].sum(axis=0) for window in within)
     # Noise of variance s^2, blurred by b: s^2 / (4 pi b^2), of a slope 1 / (2 b^2) of that.
@@ -334,7 +327,7 @@ def _window_equations(corrected: xr.Dataset, scale: Scale) -> list[Array]:
         squares = np.array([len(rate), len(rate) * slope, len(rate) * slope, np.sum(rate**2)])
         squares *= side**2 * level
         strong = [window for window in windows if window[0] > (_STRONG + 1.0) * squares[0]]
-        result.append(normal_equations(np.reshape(strong, (-1, 15)), squares))
+        result.append(images.normal_equations(np.reshape(strong, (-1, 15)), squares))
     return result
 
 

@@ -110,7 +110,7 @@ def _matched(corrected: xr.Dataset, capture: Capture) -> xr.Dataset:
         field, _ = matching.refine(level(0, factor), field)
     fine = level(0, 1)
     field, data = matching.refine(fine, field)
-    spread = _variances(field, fine, _resolved(data), _squares(data))
+    spread = _variances(field, fine, data)
     # What a rate's planes are of the delay's, by its functions.
     times = corrected["time"].values[capture.frames]
     change = np.asarray(np.gradient(np.eye(times.size), times, axis=0)).T @ functions[-1]
@@ -164,9 +164,8 @@ def _coarse(
         if begin is None:
             continue
         field, data = matching.refine(level, begin)
-        resolved, squares = _resolved(data, factor), _squares(data, factor)
-        variance = _variances(field, level, resolved, squares)
-        size = 0.25 * np.log(variance).sum(axis=0)
+        resolved = _resolved(data, factor)
+        size = 0.25 * np.log(_variances(field, level, data)).sum(axis=0)
         gain, distance = np.inf, 0.0
         if before is not None:
             gain = np.mean((sizes - size)[earlier])
@@ -189,20 +188,19 @@ def _resolved(data: Information, factor: int = 1) -> Mask:
     return np.asarray(area * matching.eigenvalues(data.tensor)[0] > 1.0 / _KNOWN**2)
 
 
-def _squares(data: Information, factor: int = 1) -> Array:
-    """Squares (2, y, x) of the steps that windows ask for, over their variances [1]."""
-    area = 4.0 * np.pi * (matching.WINDOW * factor) ** 2
-    tensor = np.moveaxis(area * data.tensor[[[0, 1], [1, 2]]], (0, 1), (-2, -1))
-    inverse = np.linalg.inv(tensor + _RIDGE * max(tensor.max(), 1.0) * np.eye(2))
-    steps = np.einsum("yxij,jyx->iyx", inverse, area * data.gradient)
-    return np.asarray(steps**2 / np.moveaxis(np.diagonal(inverse, axis1=2, axis2=3), 2, 0))
-
-
-def _variances(field: Field, level: Movies, resolved: Mask, squares: Array) -> Array:
+def _variances(field: Field, level: Movies, data: Information) -> Array:
     """Variance (2, y, x) of a field [pixel^2], times the data's reduced chi-square about the field.
 
     The field is smoother than the reflection where windows ask for steps beyond their own noise.
     """
+    # Squares of the steps that windows ask for, over their variances.
+    area = 4.0 * np.pi * (matching.WINDOW * level.factor) ** 2
+    tensor = np.moveaxis(area * data.tensor[[[0, 1], [1, 2]]], (0, 1), (-2, -1))
+    inverse = np.linalg.inv(tensor + _RIDGE * max(tensor.max(), 1.0) * np.eye(2))
+    steps = np.einsum("yxij,jyx->iyx", inverse, area * data.gradient)
+    squares = steps**2 / np.moveaxis(np.diagonal(inverse, axis1=2, axis2=3), 2, 0)
+    # Their mean around each pixel, where windows resolve the shift.
+    resolved = _resolved(data, level.factor)
     blur = partial(gaussian_filter, sigma=_WIDE / level.factor, axes=(-2, -1))
     chi = np.maximum(blur(squares * resolved) / np.maximum(blur(resolved * 1.0), 1e-9), 1.0)
     return np.asarray(chi * field.variances(level.centres()))

@@ -12,7 +12,7 @@ from dbthermal._warnings import warned
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment import _views as views
 from dbthermal.alignment._offset import SEARCH, noise_levels, require_one_clock, sample, time_offset
-from dbthermal.alignment._views import Movie
+from dbthermal.alignment._products import Movie
 
 STEP: Final = 5.0  # standard deviations of noise of a step between two frames
 

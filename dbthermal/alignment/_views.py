@@ -11,8 +11,7 @@ from scipy.sparse import csr_array, diags_array, eye_array
 from dbthermal import _rows, schema
 from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
-
-Movie = npt.NDArray[np.float32]
+from dbthermal.alignment._products import Movie
 
 TRANSFORM: Final = schema.Variable(
     ("band", "row", "column"), "float64", "1", "pixel of the first view to pixel of this one"

@@ -14,26 +14,16 @@ from typing import Final, TypeAlias
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
-from scipy.ndimage import (
-    gaussian_filter,
-    laplace,
-    maximum_filter,
-    minimum_filter,
-    uniform_filter,
-)
+from scipy import ndimage
 from scipy.signal import fftconvolve
 
 from dbthermal import _smooth as smooth
+from dbthermal import schema
 from dbthermal._arrays import Array, empty, quotient, release
 from dbthermal._samples import without_gaps
+from dbthermal.separation import _misfit as misfits
 from dbthermal.separation._inputs import Inputs
-from dbthermal.separation._misfit import (
-    Misfit,
-    Reading,
-    object_weights,
-    reflected,
-    smooth_functions,
-)
+from dbthermal.separation._misfit import Misfit, Reading
 from dbthermal.separation._subspace.reflection_ratio import HIGHEST_ORDER
 
 _ROUNDS, _STEP, _SETTLED = 8, 4.0, 0.05  # turns, largest step [pixel^2], and share of the last one
@@ -69,12 +59,8 @@ class Equalised:
     @property
     def sentence(self) -> str:
         """Sentence on how much the reflections in each band were blurred."""
-        blurs = ", ".join(
-            f"'{band}' {deviation:.2f}"
-            for band, deviation in zip(
-                self.capture["band"].values, np.sqrt(self.variances), strict=True
-            )
-        )
+        pairs = zip(self.capture["band"].values, np.sqrt(self.variances), strict=True)
+        blurs = ", ".join(f"'{band}' {deviation:.2f}" for band, deviation in pairs)
         return (
             f"The bands are not equally sharp: reflections were blurred by {blurs} pixel, and the "
             "deviations hold what that may do to details of the object."
@@ -85,7 +71,6 @@ def equalise(
     corrected: xr.Dataset, inputs: Inputs, result: xr.Dataset, misfit: Misfit
 ) -> Equalised | None:
     """Blur the sharper bands as much as the others, if they differ; None if not."""
-    sound = result["status"].values == 0
     excess = np.zeros(len(inputs.bands))
     for hints in misfit.answers[sharpness]:
         for place, (force, _, variance) in enumerate(hints, 1):
@@ -97,8 +82,8 @@ def equalise(
     # Blur what smooth functions of time do not hold: maps of their coefficients say what they do.
     counts = empty(corrected["counts"].shape, np.float32)
     factor = np.ones(excess.size)
-    square = np.zeros(sound.shape)
-    weights = object_weights(inputs, result)
+    square = np.zeros(result["status"].shape)
+    weights = misfits.object_weights(inputs, result)
     for band, film in enumerate(counts):
         film[:] = corrected["counts"].values[band]
         if variances[band] > 0.0:
@@ -112,8 +97,7 @@ def equalise(
             share = (1.0 - factor[band] ** 2) * HIGHEST_ORDER / len(film)
             square += share * (weights[band] * inputs.noise[band]) ** 2
         release()
-    if "noise_factor" in corrected:
-        factor = factor * corrected["noise_factor"].values
+    factor = factor * schema.noise_factor(corrected)
     variable = corrected["counts"].copy(data=counts)
     capture = corrected.assign(counts=variable, noise_factor=("band", factor))
     return Equalised(capture, variances, np.sqrt(square))
@@ -127,10 +111,10 @@ def _blur_rapid(film: npt.NDArray[np.float32], inputs: Inputs, deviation: float)
     """
     valid = np.isfinite(film) & inputs.good
     filled = np.stack([without_gaps(*pair) for pair in zip(film, valid, strict=True)])
-    functions = smooth_functions(inputs, np.ones(len(film), dtype=bool)).astype(np.float32)
+    functions = misfits.smooth_functions(inputs, np.ones(len(film), dtype=bool)).astype(np.float32)
     maps = np.tensordot(functions.T, filled, 1)
     change = np.stack([_blurred(image, deviation) - image for image in maps])
-    outside = 1.0 - gaussian_filter(np.ones(film.shape[1:]), deviation, mode="constant")
+    outside = 1.0 - ndimage.gaussian_filter(np.ones(film.shape[1:]), deviation, mode="constant")
     square = np.sum(change.astype(np.float64) ** 2, axis=0)
     for frame, values, used, coefficients in zip(film, filled, valid, functions, strict=True):
         blurred = _blurred(values, deviation) - np.tensordot(coefficients, change, 1)
@@ -140,7 +124,7 @@ def _blur_rapid(film: npt.NDArray[np.float32], inputs: Inputs, deviation: float)
 
 
 def _blurred(image: npt.NDArray[np.floating], deviation: float) -> Array:
-    return np.asarray(gaussian_filter(image, deviation, mode="nearest"))
+    return np.asarray(ndimage.gaussian_filter(image, deviation, mode="nearest"))
 
 
 def _blocks(inputs: Inputs) -> list[slice]:
@@ -164,10 +148,9 @@ def _difference(inputs: Inputs, result: xr.Dataset, place: int) -> float:
     excess, every = 0.0, _blocks(inputs)
     rows = every[:: max(1, len(every) // _BLOCKS)]
     for turn in range(_ROUNDS):
-        readings = (reflected(inputs, result, block) for block in rows)
-        forces, form, variance = np.sum(
-            [_equations(inputs, result, place, excess, reading) for reading in readings], axis=0
-        )
+        readings = (misfits.reflected(inputs, result, block) for block in rows)
+        sums = [_equations(inputs, result, place, excess, reading) for reading in readings]
+        forces, form, variance = np.sum(sums, axis=0)
         if form <= 0.0 or (turn == 0 and forces**2 < _SURE**2 * variance):
             return 0.0
         step = 2.0 * forces / form
@@ -202,10 +185,11 @@ def _equations(
     moving = pixels.reshape(shape) & np.isfinite(ratio)
     ratio, used = np.where(moving, ratio, 1.0), inner & moving
     # At the border of a material reflectivities change, not reflections.
-    within = maximum_filter(ratio, _BORDER) < _ALIKE * minimum_filter(ratio, _BORDER)
+    least = ndimage.minimum_filter(ratio, _BORDER)
+    within = ndimage.maximum_filter(ratio, _BORDER) < _ALIKE * least
     used &= within | (np.count_nonzero(used & within) < _MOSTLY * np.count_nonzero(used))
     blurs = np.sqrt(_COMMON + np.array([max(excess, 0.0), max(-excess, 0.0)]))
-    basis = smooth_functions(inputs, frames)
+    basis = misfits.smooth_functions(inputs, frames)
     if leading is not None:
         changes = films[0][:, pixels]
         changes = smooth.leading((changes - basis @ (basis.T @ changes)).T, leading)
@@ -223,14 +207,14 @@ def _equations(
         for order, part, blur in zip((0, place), (moving, moving / ratio), blurs, strict=True)
     )
     remainder, reflection = rapid(second - first), rapid(first)
-    curvature = rapid(laplace(first, axes=(1, 2)))
+    curvature = rapid(ndimage.laplace(first, axes=(1, 2)))
     # Noise in the products: that of the first band, in all three.
     free = len(basis) - basis.shape[1]
     levels = inputs.noise[[inputs.bands[0], inputs.bands[place]]] ** 2
     point = np.zeros((1 + 2 * int(np.ceil(4.0 * _BROAD)),) * 2)
     point[point.shape[0] // 2, point.shape[1] // 2] = 1.0
     spread = _details(point, blurs[0])
-    bent = laplace(spread)
+    bent = ndimage.laplace(spread)
     level, mixed, bending = (
         free * levels[0] * fftconvolve(moving, a * b, mode="same")
         for a, b in ((spread, spread), (spread, bent), (bent, bent))
@@ -244,7 +228,7 @@ def _equations(
     )
     # The error of the ratio, of a neighbourhood, is eliminated.
     local = [
-        uniform_filter(np.where(used, values, 0.0), _AROUND, mode="constant")
+        ndimage.uniform_filter(np.where(used, values, 0.0), _AROUND, mode="constant")
         for values in (*products, _MOVING * level)
     ]
     used &= local[2] > local[5]
@@ -252,5 +236,4 @@ def _equations(
     forces, form = products[1] - share * products[0], products[4] - share * products[3]
     noisy = levels[1] * np.square(gain[1]).reshape(shape) / ratio**2
     variance = (noisy + levels[0]) * (form + bending)
-    sums = (float(values[used].sum()) for values in (forces, form, variance))
-    return next(sums), next(sums), next(sums)
+    return float(forces[used].sum()), float(form[used].sum()), float(variance[used].sum())

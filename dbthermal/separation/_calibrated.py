@@ -44,7 +44,6 @@ class CalibratedSettings:
     smooth: bool = True
 
     def __post_init__(self) -> None:
-        """Refuse what is no truth value."""
         check_fields(self, "calibrated")
 
 
@@ -70,13 +69,13 @@ def separate(tile: Tile, settings: CalibratedSettings) -> Estimate:
         gray = _gray(e, covariance)
     # Flag gray pixels, and those without a solution.
     solved &= np.all(np.isfinite(values), axis=0)
-    values = [np.where(solved, value, np.nan) for value in values]
     lost = ~np.all(solved, axis=0) & ~gray
+    values = [np.where(solved & ~gray, value, np.nan) for value in values]
     status = status_bits({Status.GRAY: gray, Status.OUTSIDE_RESPONSE: lost})
     std = np.sqrt(np.einsum("bbp->bp", covariance))
     warm, warm_std, cold, cold_std = values
     estimate = Estimate(warm, warm_std, cold, cold_std, e, std, status)
-    return estimate.undefine(gray, np.zeros_like(gray), gray).check_range(tile.curves[0])
+    return estimate.check_range(tile.curves[0])
 
 
 def _gray(emissivity: Array, covariance: Array) -> Mask:

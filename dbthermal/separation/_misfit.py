@@ -20,6 +20,7 @@ import numpy.typing as npt
 import xarray as xr
 from scipy.ndimage import uniform_filter
 
+from dbthermal import schema
 from dbthermal._arrays import Array, Mask, quotient, release
 from dbthermal._compiled import compiled
 from dbthermal.separation import _tiles as tiles
@@ -150,16 +151,14 @@ def _single(blocks: _Blocks) -> Array:
 
 def _leak(blocks: _Blocks) -> Array:
     """Deviation (row, column) of the share of the reflection that is left, over the events."""
-    (cross, energy), (remainder, reflection, _) = (
-        _local_mean(blocks, values) for values in (blocks.products, blocks.noise)
-    )
+    cross, energy = _local_mean(blocks, blocks.products)
+    remainder, reflection, _ = _local_mean(blocks, blocks.noise)
     freedom = _local_mean(blocks, blocks.freedom)
     strong = energy > _MOVING * freedom * reflection
     energy = np.where(strong, energy, 0.0)
     share = quotient(cross, energy, 0.0)
-    variance = quotient(
-        remainder * (energy + freedom * reflection) / _number(blocks), energy**2, 0.0
-    )
+    noise = remainder * (energy + freedom * reflection) / _number(blocks)
+    variance = quotient(noise, energy**2, 0.0)
     # Scatter of the events about their mean, less noise, by the weight of each.
     total = energy.sum(axis=0)
     weight = quotient(energy, total + 0.0 * energy, 0.0)
@@ -182,10 +181,12 @@ def _of_rows(inputs: Inputs, result: xr.Dataset, reading: Reading) -> _Blocks:
     place = np.where(pixels, row // _BLOCK * shape[1] + column // _BLOCK, -1)
     number = np.bincount(place[pixels], minlength=shape[0] * shape[1]).astype(np.float64)
     # Weigh the bands, and average what is left beside the object, and the reflection.
-    weights, noise = _weights(
-        np.where(pixels, ratio, 0.5), inputs.noise[inputs.bands, np.newaxis] * gain
-    )
-    span, event = _spans(frames)
+    deviation = inputs.noise[inputs.bands, np.newaxis] * gain
+    weights, noise = _weights(np.where(pixels, ratio, 0.5), deviation)
+    # A span of time is an octave beyond the smooth functions, half of an event.
+    length = _length(frames.size)
+    event, half = np.divmod(np.flatnonzero(frames), length)
+    span = np.unique(2 * event + (2 * half >= length), return_inverse=True)[1]
     remainder, reflection = np.zeros((2, signals.shape[1], number.size))
     _average(signals[0], reflections, weights, place, remainder, reflection)
     single = _single_pixels(inputs, signals, weights, frames, place, column, number.size)
@@ -195,18 +196,18 @@ def _of_rows(inputs: Inputs, result: xr.Dataset, reading: Reading) -> _Blocks:
     noise = np.stack(summed) / filled**2
     # Take the smooth functions out, and sum over means and events.
     basis = smooth_functions(inputs, frames)
-    remainder, reflection = (
-        film - basis @ (basis.T @ film) for film in (remainder / filled, reflection / filled)
-    )
+    remainder, reflection = remainder / filled, reflection / filled
+    remainder -= basis @ (basis.T @ remainder)
+    reflection -= basis @ (basis.T @ reflection)
     stated = _stated(inputs, result, rows, pixels)
     stated = np.bincount(place[pixels], stated[pixels], number.size) / filled
-    factor = inputs.capture.get("noise_factor", np.ones(1))
-    if inputs.displacement is not None or np.any(factor < 1.0):  # neighbours share noise
+    resampled = np.any(schema.noise_factor(inputs.capture) < 1.0)
+    if inputs.displacement is not None or resampled:  # neighbours share noise
         jumps = np.diff(remainder, 2, axis=0)
         noise[0] = np.maximum(noise[0], np.mean(jumps**2, axis=0) / 6.0)
     means = np.eye(span[-1] + 1)[span].T / np.bincount(span)[:, np.newaxis]
     leverage = np.mean(np.sum(means**2, axis=1) - np.sum((means @ basis) ** 2, axis=1))
-    events = np.eye(inputs.capture.sizes["time"] // _length(len(frames)) + 1)[event].T
+    events = np.eye(frames.size // length + 1)[event].T
     freedom = np.outer(events @ (1.0 - np.sum(basis**2, axis=1)), np.ones(number.size))
     averages: tuple[Array, ...] = (
         np.where(number < 0.5 * _BLOCK**2, 0.0, number),
@@ -236,9 +237,7 @@ def _single_pixels(
     middle = np.flatnonzero(column[:-1] % _BLOCK == 1)
     alike = (place[middle - 1] == place[middle]) & (place[middle] == place[middle + 1])
     middle = middle[alike & (place[middle] >= 0)]
-    segment = np.zeros(signals.shape[1], dtype=np.intp)
-    if "segment" in inputs.capture:
-        segment = inputs.capture["segment"].values[frames].astype(np.intp)
+    segment = schema.segments(inputs.capture)[frames]
     squares = _compare(signals, weights, middle, segment, _length(len(frames)) // 2)
     sums = np.stack([np.bincount(place[middle], values, blocks) for values in squares])
     return np.asarray(sums / np.maximum(np.bincount(place[middle], minlength=blocks), 1.0))
@@ -270,9 +269,8 @@ def read(inputs: Inputs, result: xr.Dataset, rows: slice) -> tuple[Array, Mask, 
     pixels &= abs(weights) @ missing.ravel() == 0.0
     for order, band in enumerate(inputs.bands[1:], 1):
         curve = inputs.curves[band]
-        emitted = result["emissivity"].values[band, source] * (
-            curve.signal(np.where(missing, curve.reference, film)) - curve.reference
-        )
+        emitted = curve.signal(np.where(missing, curve.reference, film)) - curve.reference
+        emitted *= result["emissivity"].values[band, source]
         np.nan_to_num(emitted, copy=False)
         shown = (weights @ emitted.reshape(len(film), -1).T).T
         signals[order] -= shown - emitted[:, within].reshape(shown.shape)
@@ -339,13 +337,6 @@ def _length(frames: int) -> int:
     return frames // min(HIGHEST_ORDER, frames // 4)
 
 
-def _spans(frames: Mask) -> tuple[Whole, Whole]:
-    """Span of each of some frames (time), an octave beyond the smooth functions, and its event."""
-    event, half = np.divmod(np.flatnonzero(frames), _length(frames.size))
-    spans = 2 * event + (2 * half >= _length(frames.size))
-    return np.unique(spans, return_inverse=True)[1], event
-
-
 def _weights(ratio: Array, deviation: Array) -> tuple[Array, Array]:
     """Weights (band, pixel) of the bands for the object's signal, at the least noise.
 
@@ -355,12 +346,8 @@ def _weights(ratio: Array, deviation: Array) -> tuple[Array, Array]:
     weights = contrast / ((deviation[1:] / ratio[1:]) ** 2 + deviation[0] ** 2)
     weights /= np.sum(weights * contrast, axis=0)
     every = np.concatenate([-weights.sum(axis=0, keepdims=True), weights / ratio[1:]])
-    noise = (
-        np.sum((every * deviation) ** 2, axis=0),
-        deviation[0] ** 2,
-        every[0] * deviation[0] ** 2,
-    )
-    return every, np.stack(noise)
+    total, first = np.sum((every * deviation) ** 2, axis=0), deviation[0] ** 2
+    return every, np.stack([total, first, every[0] * first])
 
 
 @compiled
@@ -439,9 +426,8 @@ def widen(inputs: Inputs, result: xr.Dataset, misfit: Misfit) -> None:
     for row in map(int, np.flatnonzero(sound.any(axis=1))):
         columns = np.flatnonzero(sound[row])
         chosen = [film[:, row, columns].astype(np.float64) for film in films]
-        leak, change, share = (
-            values[row, columns] for values in (misfit.leak, everything, emissivity)
-        )
+        leak, change = misfit.leak[row, columns], everything[row, columns]
+        share = emissivity[row, columns]
         counted = np.isfinite(chosen[0]).sum(axis=0)
         mean = quotient(np.nansum(chosen[0], axis=0), counted, curve.reference)
         slope = curve.slope(mean)

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 import xarray as xr
 from tqdm import tqdm
 
-from dbthermal import _numbers, store
+from dbthermal import _numbers, schema, store
 from dbthermal import _text as texts
 from dbthermal.separation import _inputs
 from dbthermal.separation._inputs import BLOCK_ROWS, Method
@@ -121,10 +121,7 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
         raise ValueError(f"Unknown method {method!r} of a run. Must be one of {list(METHODS)}.")
     require_seed(seed)
     memory = _numbers.real_number("memory [byte]", memory, _numbers.POSITIVE)
-    if not isinstance(provenance, Mapping):
-        raise TypeError(
-            f"Invalid provenance of type {type(provenance).__name__}. Must be a mapping."
-        )
+    schema.require(provenance, Mapping, "provenance")
     options: dict[str, Any] = {"settings": settings, "mask": mask, "seed": seed}
     options |= {"emissivity": emissivity, "emissivity_std": emissivity_std}
     options |= {"emissivity_covariance": emissivity_covariance, "response_kind": response_kind}
@@ -286,9 +283,8 @@ def _share(
 ) -> tuple[int, tuple[int, int], int]:
     """Threads of a process, rows and columns of a block, as `solve` reads or fewer, rows read."""
     counts, columns = capture["counts"], capture.sizes["x"]
-    column, lazy = counts[..., 0, 0].size, counts.chunksizes.get("y", ())
-    stored = counts.encoding.get("preferred_chunks", {})
-    chunks = counts.chunksizes
+    chunks, stored = counts.chunksizes, counts.encoding.get("preferred_chunks", {})
+    column, lazy = counts[..., 0, 0].size, chunks.get("y", ())
     chunk, chunk_width = (max(chunks.get(dim, ()), default=stored.get(dim, 1)) for dim in "yx")
     sample = _TILE if method.compiled else _TILE * _TIMES
     tile = sample * largest(method, settings, capture) * column

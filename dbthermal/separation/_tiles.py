@@ -29,7 +29,6 @@ Whole = npt.NDArray[np.intp]
 Mask = npt.NDArray[np.bool_]
 Window = tuple[slice, slice]
 """Rows and columns of a tile in the image."""
-Loader = Callable[[], tuple[xr.Dataset, list[Grain]]]
 
 KEPT_ATTRS: Final = ("origin", "radiometric", "source", "twin")
 """Attributes of a capture that its result has, too."""
@@ -37,9 +36,8 @@ KEPT_ATTRS: Final = ("origin", "radiometric", "source", "twin")
 PIXELS: Final = 320
 """Pixels in a tile, unless a method sets its own number."""
 
-SAMPLES: Final = 2**19
-"""Samples of a band in a tile, at most: with more, 30,000 frames take 1.3 times as long."""
-
+# Samples of a band in a tile, at most: with more, 30,000 frames take 1.3 times as long.
+_SAMPLES: Final = 2**19
 _COMPILED: Final = 8  # times as many pixels in a tile of a compiled method
 # Samples of a band that are resampled at once: few rows would mostly read those around them.
 _TOGETHER: Final = 2**23
@@ -61,7 +59,6 @@ class Pixels:
     """A record of arrays and records, optional ones among them, whose last axis is the pixel."""
 
     def select_pixels(self, selected: Mask | Whole) -> Self:
-        """Return the record of the selected pixels alone."""
         arrays: dict[str, Any] = {}
         for name, value in vars(self).items():
             within = value.select_pixels(selected) if isinstance(value, Pixels) else value
@@ -144,19 +141,15 @@ class Tile:
 
     def mixed(self, emissivity: Array, temperatures: Array) -> Array:
         """Signals (band, time, pixel) [K] of object and background (2, time, pixel) [K]."""
-        x, y = temperatures
-        return np.stack(
-            [
-                mixing.mixed(share, self.blackbody(band, x), self.blackbody(band, y))
-                for band, share in enumerate(emissivity)
-            ]
-        )
+        signals = []
+        for band, share in enumerate(emissivity):
+            emitted, reflected = (self.blackbody(band, film) for film in temperatures)
+            signals.append(mixing.mixed(share, emitted, reflected))
+        return np.stack(signals)
 
     def select_frames(self, selected: Mask) -> "Tile":
-        """Return the tile with the selected frames (time) alone."""
         segment = None if self.segment is None else self.segment[selected]
-        signals = select(self.signals, selected, axis=1)
-        time = self.time[selected]
+        signals, time = select(self.signals, selected, axis=1), self.time[selected]
         return replace(self, signals=signals, time=time, segment=segment, division=None)
 
     def select_pixels(self, selected: Mask | Whole) -> "Tile":
@@ -202,16 +195,6 @@ class Estimate(Pixels):
         value = std if emissivity is None else emissivity
         return cls(object_temperature, missing, background, missing, value, std, status)
 
-    def undefine(self, no_object: Mask, no_emissivity: Mask, no_background: Mask) -> "Estimate":
-        """Set quantities and their standard deviations to NaN in some pixels (pixel) each."""
-        where = {"object": no_object, "emissivity": no_emissivity, "background": no_background}
-        arrays: dict[str, Any] = {
-            name: np.where(where[name.split("_")[0]], np.nan, value)
-            for name, value in vars(self).items()
-            if name.split("_")[0] in where and value is not None
-        }
-        return replace(self, **arrays)
-
     def replace_scatter(self, order: int, selected: Mask, scatter: Array, frames: Array) -> None:
         """Replace a scatter of a sound survey, and its degrees of freedom (pixel), in place."""
         if self.survey is not None:
@@ -238,15 +221,11 @@ class Estimate(Pixels):
             values[name] = np.where(lost, np.nan, value)
             values[f"{name}_std"] = np.where(lost, np.nan, std)
             if name.endswith("temperature"):
-                beyond |= np.any(out_of_range(value, std, curve), axis=0)
+                margin = RANGE_SIGMAS * np.nan_to_num(std, posinf=np.inf)
+                outside = (value < curve.lowest - margin) | (value > curve.highest + margin)
+                beyond |= np.any(outside, axis=0)
         status = self.status | status_bits({Status.OUTSIDE_RESPONSE: beyond})
         return replace(self, **values, status=status)
-
-
-def out_of_range(temperature: Array, std: Array, curve: Curve) -> Mask:
-    """Temperatures [K] outside the calibrated range of a response by several deviations."""
-    margin: Array = RANGE_SIGMAS * np.nan_to_num(std, posinf=np.inf)
-    return (temperature < curve.lowest - margin) | (temperature > curve.highest + margin)
 
 
 Section = tuple[Mask, Mask, Tile]  # frames (time), pixels (pixel), and the tile of these
@@ -263,7 +242,7 @@ class Cut:
     parts: list[Section]
 
 
-def windows(rows: slice, width: int, pixels: int = PIXELS) -> Iterator[Window]:
+def windows(rows: slice, width: int, pixels: int) -> Iterator[Window]:
     """Yield windows of at most so many pixels that cover some rows of an image."""
     columns = min(width, pixels)
     height = max(1, pixels // columns)
@@ -275,14 +254,8 @@ def windows(rows: slice, width: int, pixels: int = PIXELS) -> Iterator[Window]:
 def largest(method: Method, settings: Any, capture: xr.Dataset) -> int:
     """Pixels in a tile of a capture, at most."""
     times = _COMPILED if method.compiled else 1
-    fitting = max(1, min(times * PIXELS, SAMPLES // capture.sizes["time"]))
+    fitting = max(1, min(times * PIXELS, _SAMPLES // capture.sizes["time"]))
     return int(getattr(settings, "batch", fitting))
-
-
-def numbers(window: Window, width: int) -> Whole:
-    """Numbers (pixel) of a window's pixels in an image of so many columns."""
-    lines = np.arange(window[0].start, window[0].stop)[:, np.newaxis] * width
-    return np.asarray((lines + np.arange(window[1].start, window[1].stop)).ravel())
 
 
 def cut(
@@ -293,19 +266,20 @@ def cut(
     Of all pixels, or of those of the image that are `wanted` (pixel).
     """
     displacement, method = inputs.displacement, inputs.method
-    load, source = _loader(inputs, rows)
+    sampled = _sampler(inputs, rows)
     width, frames = inputs.capture.sizes["x"], inputs.capture.sizes["time"]
     most = largest(method, inputs.settings, inputs.capture)
     size = most if displacement is None else max(width, _TOGETHER // frames)
-    size = (source.stop - source.start) * width if method.whole_image else size
+    size = (rows.stop - rows.start) * width if method.whole_image else size
     # Read each window, judge its samples, and group its pixels by their valid frames.
     for window in windows(rows, width, size):
-        places = numbers(window, width)
+        lines, columns = (np.arange(span.start, span.stop) for span in window)
+        places = np.add.outer(lines * width, columns).ravel()
         selected = slice(None) if wanted is None else np.flatnonzero(wanted[places])
         places = places[selected]
         if places.size == 0:
             continue
-        counts, usable, valid, status, gain = _sampled(inputs, load, source, window, selected)
+        counts, usable, valid, status, gain = sampled(window, selected)
         if method.whole_image or method.every_frame:
             sets = quality.common_frames(counts, usable, status, method.minimum_frames)
         else:
@@ -325,10 +299,10 @@ def cut(
             whole = method.whole_image or np.all(pixels)
             section = tile if whole else tile.select_pixels(pixels)
             section = section if np.all(used) else section.select_frames(used)
-            groups = iter([(used, pixels, section)])
-            if displacement is not None:
-                groups = of_one_noise(used, pixels, section, gain, most)
-            sections.extend(groups)
+            if displacement is None:
+                sections.append((used, pixels, section))
+            else:
+                sections.extend(of_one_noise(used, pixels, section, gain, most))
         yield Cut(window, places, status, valid, sections)
 
 
@@ -339,8 +313,7 @@ def read(inputs: Inputs, rows: slice) -> tuple[Array, Mask, Mask, Array]:
     noise (band, pixel) over that of a sample.
     """
     window = rows, slice(0, inputs.capture.sizes["x"])
-    load, source = _loader(inputs, rows)
-    counts, usable, _, status, gain = _sampled(inputs, load, source, window, slice(None))
+    counts, usable, _, status, gain = _sampler(inputs, rows)(window, slice(None))
     sets = quality.common_frames(counts, usable, status, inputs.method.minimum_frames)
     frames, pixels = sets[0] if sets else (np.ones(len(usable), dtype=bool), status < 0)
     signals = _tile(inputs, counts, window, slice(None)).signals
@@ -348,9 +321,10 @@ def read(inputs: Inputs, rows: slice) -> tuple[Array, Mask, Mask, Array]:
     return signals, frames, pixels, gain[[0] + [1] * (len(signals) - 1)]
 
 
-def _loader(inputs: Inputs, rows: slice) -> tuple[Loader, slice]:
-    """Loader of the rows that show some rows, with the grains of their bands; and those rows."""
-    source = rows if inputs.displacement is None else inputs.displacement.source(rows)
+def _sampler(inputs: Inputs, rows: slice) -> Callable[[Window, slice | Whole], displaced.Paired]:
+    """Function that reads some pixels of a window of the rows, as `displaced.paired`."""
+    displacement, fewest = inputs.displacement, inputs.method.minimum_frames
+    source = rows if displacement is None else displacement.source(rows)
     slopes = np.array([curve.reference_slope for curve in inputs.curves])
 
     @cache  # and never read where all that is wanted of it is kept
@@ -358,26 +332,21 @@ def _loader(inputs: Inputs, rows: slice) -> tuple[Loader, slice]:
         block = inputs.capture.isel(y=source).load()
         return block, quality.grains(block, inputs.noise * slopes)
 
-    return load, source
+    def sampled(window: Window, selected: slice | Whole) -> displaced.Paired:
+        if displacement is not None:
+            return displaced.paired(load, displacement, window[0], source, selected, fewest)
+        block, grains = load()
+        lines = slice(window[0].start - rows.start, window[0].stop - rows.start)
+        view = block.isel(y=lines, x=window[1])
+        if not isinstance(selected, slice):  # as one row
+            places = np.divmod(selected[np.newaxis], view.sizes["x"])
+            y, x = (xr.DataArray(place, dims=("y", "x")) for place in places)
+            view = view.drop_vars(("y", "x"), errors="ignore").isel(y=y, x=x)
+        counts, valid, status = quality.read(view, fewest, grains)
+        counts, usable = quality.bridge(counts, valid, view["time"].values.astype(np.float64))
+        return counts, usable, valid, status, np.ones((2, status.size))
 
-
-def _sampled(
-    inputs: Inputs, load: Loader, source: slice, window: Window, selected: slice | Whole
-) -> displaced.Paired:
-    """Samples of some pixels of a window of the source, as `displaced.paired`."""
-    displacement, fewest = inputs.displacement, inputs.method.minimum_frames
-    if displacement is not None:
-        return displaced.paired(load, displacement, window[0], source, selected, fewest)
-    block, grains = load()
-    rows = slice(window[0].start - source.start, window[0].stop - source.start)
-    view = block.isel(y=rows, x=window[1])
-    if not isinstance(selected, slice):  # as one row
-        places = np.divmod(selected[np.newaxis], view.sizes["x"])
-        y, x = (xr.DataArray(place, dims=("y", "x")) for place in places)
-        view = view.drop_vars(("y", "x"), errors="ignore").isel(y=y, x=x)
-    counts, valid, status = quality.read(view, fewest, grains)
-    counts, usable = quality.bridge(counts, valid, view["time"].values.astype(np.float64))
-    return counts, usable, valid, status, np.ones((2, status.size))
+    return sampled
 
 
 def _tile(inputs: Inputs, counts: Array, window: Window, selected: slice | Whole) -> Tile:

@@ -193,10 +193,10 @@ def solve(
         raw, solved = _solvable(inputs, result, maps, material)
         equations = system.equations(inputs, system.inside(raw), solved)
         pooled = material is not None and np.isfinite(material.emissivity).any()
-        places, sampled = equations.solved, looked_at(result.sizes["time"])
-        if pooled and frames.smooth:
-            sampled = frames.nodes
-        change = system.change(inputs, equations.ways[relaxation.LOOSE], solved)
+        sampled = frames.nodes if pooled and frames.smooth else looked_at(result.sizes["time"])
+        places = equations.solved
+        unlike = system.unlike(result, solved)
+        change = system.change(inputs, equations.ways[relaxation.LOOSE], unlike)
         shares = system.coefficients(inputs, raw, solved)[:, places]
         if maps is not None:
             target, size = _by_maps(inputs, maps, raw, material, places)

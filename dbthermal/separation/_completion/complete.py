@@ -222,9 +222,8 @@ def _complete_rows(scene: Scene, completed: xr.Dataset, lacking: Mask, rows: sli
 
     The samples that lack one of the films are marked (time, y, x), in place.
     """
-    films, maps = (
-        [np.isnan(completed[name].values[:, rows]) for name in names] for names in (FILMS, MAPS)
-    )
+    films = [np.isnan(completed[name].values[:, rows]) for name in FILMS]
+    maps = [np.isnan(completed[name].values[:, rows]) for name in MAPS]
     lacking[:, rows] = np.any(films, axis=0)
     pixels = lacking[:, rows].any(axis=0) | np.any(maps, axis=(0, 1))
     if not pixels.any():

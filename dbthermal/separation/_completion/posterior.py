@@ -91,9 +91,8 @@ def moments(tile: Tile, data: Curve, prior: Mixture, level: Level) -> Moments:
     knowledge = tuple(np.ascontiguousarray(np.moveaxis(array, -1, 0)) for array in arrays)
     tables, weight = frames.response_tables(tile), np.log(prior.weight)
     _moments(tables, weight, knowledge, (share, means, spreads))
-    (plain, mean), (covariance, spread) = (
-        np.ascontiguousarray(np.moveaxis(array, 0, -1)) for array in (means, spreads)
-    )
+    plain, mean = np.ascontiguousarray(np.moveaxis(means, 0, -1))
+    covariance, spread = np.ascontiguousarray(np.moveaxis(spreads, 0, -1))
     # The blackest emissivity that is as improbable; the grid rises.
     above = np.cumsum(share.T[::-1], axis=0)[::-1] - 0.5 * share.T
     blackest = _crossing(grid, above, _WORSE)
@@ -114,9 +113,9 @@ def moments(tile: Tile, data: Curve, prior: Mixture, level: Level) -> Moments:
 def _crossing(grid: Array, falling: Array, level: float) -> Array:
     """Place (pixel) on a grid (grid, pixel) at which a function that falls along it has a value."""
     after = np.clip((falling > level).sum(axis=0), 1, len(grid) - 1)
-    (low, high), (more, less) = (
-        np.take_along_axis(share, np.stack([after - 1, after]), 0) for share in (grid, falling)
-    )
+    ends = np.stack([after - 1, after])
+    low, high = np.take_along_axis(grid, ends, axis=0)
+    more, less = np.take_along_axis(falling, ends, axis=0)
     share = np.clip((more - level) / np.maximum(more - less, 1e-300), 0.0, 1.0)
     return np.asarray(low + share * (high - low))
 

@@ -57,14 +57,13 @@ def stated(prior: str | xr.DataArray | xr.Dataset | None, bands: list[str]) -> M
             names = known["material"].values.tolist()
             raise ValueError(f"Unknown prior '{prior}'. Must be one of {names}.")
         prior = known.sel(material=prior)
-    std: xr.DataArray | None = None
+    stds = np.full(len(bands), SAMPLE_STD)
     if isinstance(prior, xr.Dataset):
         if missing := {"emissivity", "emissivity_std"} - set(prior):
             raise ValueError(f"Missing variable '{min(missing)}' in the prior. Has {list(prior)}.")
         prior, std = prior["emissivity"], prior["emissivity_std"]
-    values, stds = schema.band_values(prior, bands, "prior", "1"), np.full(len(bands), SAMPLE_STD)
-    if std is not None:
         stds = schema.band_values(std, bands, "emissivity_std of the prior", "1")
+    values = schema.band_values(prior, bands, "prior", "1")
     for name, part in (("emissivities", values), ("emissivity_std", stds)):
         if not np.all((part > 0) & (part < 1)):
             raise ValueError(f"Invalid {name} {part.tolist()} of the prior. Must lie in (0, 1).")

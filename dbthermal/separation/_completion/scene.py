@@ -272,9 +272,7 @@ def find_level(scene: Scene, sample: Sample) -> Level:
         return level
     value, variance, pixels = value[seen], variance[seen], np.concatenate(counted)[seen]
     weight = pixels / (variance + np.median(variance))
-    order = np.argsort(value)
-    share = np.cumsum(weight[order]) / weight.sum()
-    middle = float(value[order][np.searchsorted(share, 0.5)])
+    middle = float(np.quantile(value, 0.5, weights=weight, method="inverted_cdf"))
     scatter = (MAD * float(np.median(np.abs(value - middle)))) ** 2
     between = max(scatter - float(np.median(variance)), 0.0)
     levels = between + _MEDIAN / float(np.sum(pixels / variance)) + _LEAST[0] ** 2

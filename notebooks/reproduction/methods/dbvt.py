@@ -13,7 +13,7 @@ nonlinearity of an exact response is taken out of the second band, and the searc
 """
 
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -228,11 +228,16 @@ def _report(
         replace(tile, signals=signals, emissivity=emissivity, emissivity_covariance=None),
         calibrated.CalibratedSettings(smooth=False),
     )
+    measured = "object_temperature", "background_temperature", "emissivity"
+    arrays: dict[str, Any] = {
+        name: np.where(lost, np.nan, getattr(solution, name)) for name in measured
+    }
     return replace(
         solution,
+        **arrays,
         **{name: np.full_like(getattr(solution, name), np.nan) for name in METHOD.not_estimated},
         status=solution.status | status_bits({Status.NOT_CONVERGED: unfinished}),
-    ).undefine(lost, lost, lost)
+    )
 
 
 METHOD: Final = Method(

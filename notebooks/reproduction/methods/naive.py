@@ -90,10 +90,11 @@ def separate(tile: Tile, settings: NaiveSettings) -> Estimate:
         (temperature, background), emissivity = np.exp(kept.logarithms), expit(kept.logits)
     lost = ~np.isfinite(kept.objective)
     status = status_bits({Status.NOT_CONVERGED: kept.active | lost})
-    estimate = Estimate.without_std(tile, temperature, status, emissivity, background)
-    return estimate.undefine(lost, lost, lost).check_range(
-        tile.curves[0], not_estimated=WITHOUT_STD
+    temperature, background, emissivity = (
+        np.where(lost, np.nan, array) for array in (temperature, background, emissivity)
     )
+    estimate = Estimate.without_std(tile, temperature, status, emissivity, background)
+    return estimate.check_range(tile.curves[0], not_estimated=WITHOUT_STD)
 
 
 def _search(tile: Tile, settings: NaiveSettings) -> _State:
