@@ -258,18 +258,11 @@ def samples(inputs: Inputs, frames: Whole) -> tuple[Floats, Floats]:
     return first, steps
 
 
-def unlike(result: xr.Dataset, solved: Mask) -> Mask:
-    """Pixels without a solution whose material is the reason: it is not that around."""
-    reasons = np.uint32(schema.Status.GRAY | schema.Status.NONPHYSICAL_EMISSIVITY)
-    return np.asarray(((result["status"].values.ravel() & reasons) != 0) & ~solved)
-
-
-def change(inputs: Inputs, loose: Whole, unlike: Mask) -> Change:
+def change(inputs: Inputs, loose: Whole) -> Change:
     """Change of the reference band's signal to p of loose pixels, smoothed over time.
 
     So smoothed it is that of e_1 u_1(x) and holds little of that of the reflection. Bad pixels have
-    no part in it. Beside an unlike material it is that from the other side of r, if this is less,
-    and its deviation that of both.
+    no part in it.
     """
     displacement = inputs.displacement
     assert displacement is not None
@@ -277,17 +270,11 @@ def change(inputs: Inputs, loose: Whole, unlike: Mask) -> Change:
     bad = displacement.once("bad", lambda: _bad(inputs))
     at_p = without(displacement.resample[loose], bad, displacement.shape[1])
     unknown = abs(at_p) @ bad > 0.0
-    across = displacement.onward[loose]  # at r + d(r), nearly as far from r as p
-    turned = ~unknown & (abs(at_p) @ unlike > 0.0)
-    turned &= (abs(across) @ (unlike | bad) == 0.0) & (across.sum(axis=1) > 0.0)
     # Only the pixels that they are made of are read.
-    pixels = np.unique(np.concatenate([loose, at_p.indices, across.indices]))
+    pixels = np.unique(np.concatenate([loose, at_p.indices]))
     film = _film(inputs, pixels).T
-    at_r = film[np.searchsorted(pixels, loose)]
-    moved, opposite = at_p[:, pixels] @ film - at_r, at_r - across[:, pixels] @ film
-    differing = (moved - opposite) @ functions.functions @ functions.object_part.T
-    turned &= np.mean(opposite**2, axis=1) < np.mean(moved**2, axis=1)
-    moved[turned], moved[unknown] = opposite[turned], 0.0
+    moved = at_p[:, pixels] @ film - film[np.searchsorted(pixels, loose)]
+    moved[unknown] = 0.0
     curves = moved @ functions.functions
     error = moved - curves @ functions.functions.T
     energy, lagged = (error**2).sum(axis=1), (error[:, 1:] * error[:, :-1]).sum(axis=1)
@@ -295,7 +282,6 @@ def change(inputs: Inputs, loose: Whole, unlike: Mask) -> Change:
     lagged = np.nan_to_num(np.clip(lagged / energy, 0.0, 0.98))
     frames, columns = functions.functions.shape
     variance = energy * columns / frames**2 * (1.0 + lagged) / (1.0 - lagged)
-    variance[turned] += np.mean(differing[turned] ** 2, axis=1)
     # One that is not known, beside bad pixels, may be as large as any other.
     largest = film if unknown.all() else curves @ functions.object_part.T
     variance[unknown] = np.max(largest**2, initial=0.0)
