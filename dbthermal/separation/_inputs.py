@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from dbthermal import _numbers, planck, schema
 from dbthermal import _samples as samples
 from dbthermal import noise as noises
+from dbthermal import planck, schema
 from dbthermal import response as responses
 from dbthermal._arrays import Array, Mask, stride
 from dbthermal._coordinates import laid_on
@@ -304,7 +304,10 @@ def _check_clock(capture: xr.Dataset, method: Method, curves: list[Curve], noise
 def _pattern(capture: xr.Dataset, curves: list[Curve]) -> Array:
     """Deviation (band) [K] of a residual fixed pattern, 0 without a variable `pattern_std`."""
     stated = capture["pattern_std"].values if "pattern_std" in capture else np.zeros(len(curves))
-    counts = _numbers.real_numbers("pattern_std [count]", stated, (0.0, schema.LARGEST))
+    counts = stated.astype(np.float64)
+    if not np.all((counts >= 0) & schema.measured(counts)):
+        values = counts.tolist()
+        raise ValueError(f"Invalid pattern_std {values} count. Must be zero or positive, finite.")
     return np.asarray(counts / [curve.reference_slope for curve in curves])
 
 

@@ -20,11 +20,11 @@ import numpy.typing as npt
 import xarray as xr
 from scipy.ndimage import uniform_filter
 
+from dbthermal import _smooth as smooth
 from dbthermal import schema
 from dbthermal._arrays import Array, Mask, quotient, release
 from dbthermal._compiled import compiled
 from dbthermal.separation import _tiles as tiles
-from dbthermal.separation._apart import equations
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._subspace.fused import FILMS
 from dbthermal.separation._subspace.reflection_ratio import HIGHEST_ORDER
@@ -319,7 +319,9 @@ def _subtract(
 
 def smooth_functions(inputs: Inputs, frames: Mask) -> Array:
     """Smooth functions (frame, number), and steps of shutter events, over some frames (time)."""
-    return equations.smooth_functions(inputs.capture, frames).functions
+    time = inputs.capture["time"].values[frames].astype(np.float64)
+    order, segment = min(HIGHEST_ORDER, time.size // 4), schema.segments(inputs.capture)[frames]
+    return smooth.subspace(time, order, segment=segment).functions
 
 
 def object_weights(inputs: Inputs, result: xr.Dataset) -> Array:

@@ -27,6 +27,7 @@ import numpy as np
 import xarray as xr
 from scipy.ndimage import convolve, distance_transform_edt, gaussian_filter, gaussian_filter1d
 
+from dbthermal import _smooth as smooth
 from dbthermal._arrays import copied, release
 from dbthermal.schema import Status
 from dbthermal.separation._apart import equations as system
@@ -35,7 +36,7 @@ from dbthermal.separation._apart.planes import Planes
 from dbthermal.separation._apart.relaxation import Floats
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._subspace import regression
-from dbthermal.separation._subspace.reflection_ratio import null_combination, smooth_functions
+from dbthermal.separation._subspace.reflection_ratio import HIGHEST_ORDER, null_combination
 from dbthermal.separation._tiles import USELESS, Mask, Material, Whole
 
 _OBJECT: Final = ("object_temperature", "object_temperature_std")
@@ -82,7 +83,7 @@ class Frames:
         """
         film, std = (result[name].values.reshape(result.sizes["time"], -1) for name in _OBJECT)
         time, every = result["time"].values, np.arange(len(film))
-        functions = smooth_functions(time).functions
+        functions = smooth.subspace(time, min(HIGHEST_ORDER, time.size // 4)).functions
         count = _NODES * functions.shape[1]
         place = 0.5 * (1.0 - np.cos(np.pi * (np.arange(count) + 0.5) / count)) * np.ptp(time)
         nodes = np.unique(np.abs(time - time[0] - place[:, np.newaxis]).argmin(axis=1))
@@ -139,7 +140,7 @@ class Joint:
         assert displacement is not None
         time, std = self.inputs.capture["time"].values, result["object_temperature_std"].values
         background = result["background_temperature"].values
-        basis = smooth_functions(time).functions
+        basis = smooth.subspace(time, min(HIGHEST_ORDER, time.size // 4)).functions
         every = []
         for rows in self.inputs.blocks:
             film = background[:, rows].reshape(time.size, -1).astype(np.float64)
