@@ -153,3 +153,17 @@ def test_a_shaking_image_of_33_rows_is_separated() -> None:
     with pytest.warns(UserWarning, match="image moved"):
         result = separation.separate(capture.isel(y=slice(0, 33)), RESPONSE)
     assert np.isfinite(result["object_temperature"].values).any(axis=0).all()
+
+
+@pytest.mark.slow
+def test_a_stated_shift_is_lessened_by_the_displacement_of_the_images() -> None:
+    """Intervals hold as where the shift is found after the images were laid on one another."""
+    capture, truth = seen(WORLDS["never registered, apart"][0], 1)
+    field = alignment.reflection_shift(capture, RESPONSE)
+    with pytest.warns(UserWarning, match="off that of"):
+        result = separation.separate(capture, RESPONSE, reflection_shift=field)
+    sound = result["status"].values == 0
+    error = np.abs(result["object_temperature"].values - truth)[:, sound]
+    holds = np.mean(error < 1.96 * result["object_temperature_std"].values[:, sound])
+    print(f"{holds:.3f} hold")
+    assert holds >= LEAST
