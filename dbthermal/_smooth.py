@@ -16,6 +16,7 @@ from dbthermal._compiled import compiled
 
 Whole = npt.NDArray[np.intp]
 
+HIGHEST_ORDER: Final = 14  # of a smooth subspace that data may choose
 PIECE_ORDER: Final = 5  # number of polynomials in a piece of time
 # Functions that a change point costs as much as: to choose where the polynomial changes fits noise,
 # too (Ninomiya 2015, doi:10.1007/s10463-014-0481-x). Half of them on either side.
@@ -92,6 +93,13 @@ def subspace(
     together[:, 1 : 1 + len(steps)] = 0.0
     object_part = np.linalg.solve(triangle.T, together.T).T
     return Subspace(functions, object_part, len(steps), functions[:, len(steps) + 1 :])
+
+
+def largest(
+    time: npt.NDArray[np.floating], segment: npt.NDArray[np.integer] | None = None
+) -> Subspace:
+    """Largest smooth subspace that data may choose, see `subspace`."""
+    return subspace(time, min(HIGHEST_ORDER, time.size // 4), segment=segment)
 
 
 def piecewise(

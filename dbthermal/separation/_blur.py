@@ -24,7 +24,6 @@ from dbthermal._samples import without_gaps
 from dbthermal.separation import _misfit as misfits
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._misfit import Misfit, Reading
-from dbthermal.separation._subspace.reflection_ratio import HIGHEST_ORDER
 
 _ROUNDS, _STEP, _SETTLED = 8, 4.0, 0.05  # turns, largest step [pixel^2], and share of the last one
 _AROUND: Final = 13  # pixels along a side of a neighbourhood with one error of the ratio
@@ -94,7 +93,7 @@ def equalise(
             point[point.shape[0] // 2, point.shape[1] // 2] = 1.0
             factor[band] = np.sqrt(np.sum(_blurred(point, deviation) ** 2))
             # Noise in the smooth functions stays as it was.
-            share = (1.0 - factor[band] ** 2) * HIGHEST_ORDER / len(film)
+            share = (1.0 - factor[band] ** 2) * smooth.HIGHEST_ORDER / len(film)
             square += share * (weights[band] * inputs.noise[band]) ** 2
         release()
     factor = factor * schema.noise_factor(corrected)

@@ -27,7 +27,6 @@ from dbthermal._compiled import compiled
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._subspace.fused import FILMS
-from dbthermal.separation._subspace.reflection_ratio import HIGHEST_ORDER
 
 Whole = npt.NDArray[np.intp]
 
@@ -39,7 +38,7 @@ _SURE, _ROUGH = 3.0, 0.1
 _MUCH: Final = 0.1  # share of the pixels whose remainders have a cause in common; plain: to 0.05
 _MOVING: Final = 3.0  # variance of a reflection's changes in an event over their noise
 # Octaves of time in smooth functions, for the octave that is seen: 1/f noise is alike in all.
-_OCTAVES: Final = float(np.log2(HIGHEST_ORDER))
+_OCTAVES: Final = float(np.log2(smooth.HIGHEST_ORDER))
 _NODES: Final = np.linspace(-1.0, 1.0, 4)  # of a cubic polynomial over the object's range
 
 
@@ -137,7 +136,7 @@ def _number(blocks: _Blocks) -> Array:
 def _change(blocks: _Blocks) -> Array:
     """Deviation (row, column) [K] by changes that no reflection explains."""
     variance, noise = _local_mean(blocks, blocks.rough)
-    freedom = _number(blocks) * HIGHEST_ORDER
+    freedom = _number(blocks) * smooth.HIGHEST_ORDER
     more = np.maximum(variance - noise, 0.0)
     return np.sqrt(np.where(more > _SURE * noise * np.sqrt(2.0 / freedom), more, 0.0))
 
@@ -320,8 +319,7 @@ def _subtract(
 def smooth_functions(inputs: Inputs, frames: Mask) -> Array:
     """Smooth functions (frame, number), and steps of shutter events, over some frames (time)."""
     time = inputs.capture["time"].values[frames].astype(np.float64)
-    order, segment = min(HIGHEST_ORDER, time.size // 4), schema.segments(inputs.capture)[frames]
-    return smooth.subspace(time, order, segment=segment).functions
+    return smooth.largest(time, schema.segments(inputs.capture)[frames]).functions
 
 
 def object_weights(inputs: Inputs, result: xr.Dataset) -> Array:
@@ -336,7 +334,7 @@ def object_weights(inputs: Inputs, result: xr.Dataset) -> Array:
 
 def _length(frames: int) -> int:
     """Frames of an event, which is as long as two smooth functions have changes of sign."""
-    return frames // min(HIGHEST_ORDER, frames // 4)
+    return frames // min(smooth.HIGHEST_ORDER, frames // 4)
 
 
 def _weights(ratio: Array, deviation: Array) -> tuple[Array, Array]:

@@ -44,7 +44,6 @@ from dbthermal.separation._overlay import (
     solved,
     sources_of,
 )
-from dbthermal.separation._subspace.reflection_ratio import HIGHEST_ORDER
 
 # Prior deviations [pixel] of rapid motion that the bands share, or do not; and of slow motion.
 _COMMON, _APART, _TURN = 3.0, 0.1, 1.0
@@ -110,7 +109,7 @@ def stabilise(
 def _expected(inputs: Inputs, path: Array) -> Array:
     """Motion [pixel] in the smooth functions, by a path (time, ...) in the next octave."""
     time = inputs.capture["time"].values.astype(np.float64)
-    order = min(HIGHEST_ORDER, time.size // 4)
+    order = min(smooth.HIGHEST_ORDER, time.size // 4)
     octave = smooth.polynomial_basis(time, 2 * order)[:, order:]
     return np.asarray(np.sqrt(np.sum((octave.T @ path) ** 2, axis=0) / time.size))
 

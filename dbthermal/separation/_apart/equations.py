@@ -313,5 +313,4 @@ def _signal(inputs: Inputs, **places: Any) -> Floats:
 def smooth_functions(capture: xr.Dataset, frames: Any = slice(None)) -> smooth.Subspace:
     """Smooth functions of the frames of a capture, with the steps of the camera."""
     time = capture["time"].values[frames].astype(np.float64)
-    order = min(reflection_ratio.HIGHEST_ORDER, time.size // 4)
-    return smooth.subspace(time, order, segment=schema.segments(capture)[frames])
+    return smooth.largest(time, schema.segments(capture)[frames])

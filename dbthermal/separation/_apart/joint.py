@@ -36,7 +36,7 @@ from dbthermal.separation._apart.planes import Planes
 from dbthermal.separation._apart.relaxation import Floats
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._subspace import regression
-from dbthermal.separation._subspace.reflection_ratio import HIGHEST_ORDER, null_combination
+from dbthermal.separation._subspace.reflection_ratio import null_combination
 from dbthermal.separation._tiles import USELESS, Mask, Material, Whole
 
 _OBJECT: Final = ("object_temperature", "object_temperature_std")
@@ -83,7 +83,7 @@ class Frames:
         """
         film, std = (result[name].values.reshape(result.sizes["time"], -1) for name in _OBJECT)
         time, every = result["time"].values, np.arange(len(film))
-        functions = smooth.subspace(time, min(HIGHEST_ORDER, time.size // 4)).functions
+        functions = smooth.largest(time).functions
         count = _NODES * functions.shape[1]
         place = 0.5 * (1.0 - np.cos(np.pi * (np.arange(count) + 0.5) / count)) * np.ptp(time)
         nodes = np.unique(np.abs(time - time[0] - place[:, np.newaxis]).argmin(axis=1))
@@ -140,7 +140,7 @@ class Joint:
         assert displacement is not None
         time, std = self.inputs.capture["time"].values, result["object_temperature_std"].values
         background = result["background_temperature"].values
-        basis = smooth.subspace(time, min(HIGHEST_ORDER, time.size // 4)).functions
+        basis = smooth.largest(time).functions
         every = []
         for rows in self.inputs.blocks:
             film = background[:, rows].reshape(time.size, -1).astype(np.float64)

@@ -84,10 +84,14 @@ def materials(
 
 def select(labels: Labels) -> Mask:
     """At most `MOST` pixels of each material, spread evenly over it, by their labels (pixel,)."""
+    order = np.argsort(labels, kind="stable")
+    ordered = labels[order]
+    first = np.searchsorted(ordered, ordered)
+    count = np.bincount(ordered[ordered >= 0], minlength=1)
+    stride = np.maximum(1, -(-count // MOST))
     result = np.zeros(labels.shape, dtype=bool)
-    for label in np.unique(labels[labels >= 0]):
-        pixels = np.flatnonzero(labels == label)
-        result[pixels[:: -(-pixels.size // MOST)]] = True
+    place = np.arange(ordered.size) - first
+    result[order] = (ordered >= 0) & (place % stride[ordered] == 0)
     return result
 
 

@@ -161,7 +161,7 @@ def _functions(tile: Tile) -> smooth.Subspace:
 def _known_functions(times: bytes, events: bytes | None) -> smooth.Subspace:
     """Smooth functions over some times: most tiles have the same."""
     segment = None if events is None else np.frombuffer(events, dtype=np.intp)
-    return reflection_ratio.smooth_functions(np.frombuffer(times), segment)
+    return smooth.largest(np.frombuffer(times), segment)
 
 
 def _report(tile: Tile, solution: Solution) -> Estimate:

@@ -198,7 +198,7 @@ def check_clock(signals: Array, time: Array, noise: Array, segment: Whole | None
     any_axis = np.full((2, white.shape[2]), np.nan)
     chi2 = []
     for clock in (time, np.arange(frames, dtype=np.float64)):
-        functions = reflection_ratio.smooth_functions(clock, segment)
+        functions = smooth.largest(clock, segment)
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             energy, used = null_energy(white, functions, any_axis)
             chi2.append(energy / (frames - used))

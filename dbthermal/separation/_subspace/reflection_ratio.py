@@ -11,13 +11,11 @@ from typing import Final
 import numpy as np
 from scipy.special import chdtri, ndtr
 
-from dbthermal import _smooth as smooth
 from dbthermal._arrays import quotient
-from dbthermal.separation._tiles import Array, Mask, Whole
+from dbthermal.separation._tiles import Array, Mask
 
 LOWEST_ORDER: Final = 3
-HIGHEST_ORDER: Final = 14
-"""Smallest and largest smooth subspace that the data may choose (number of functions)."""
+"""Smallest smooth subspace that the data may choose (number of functions)."""
 
 # Functions by which the two large orders differ that the ratios of a material are compared at. What
 # the order of a pixel leaves of its object, unseen in its noise, adds up over a material's pixels.
@@ -32,11 +30,6 @@ CHANCE: Final = float(2.0 * ndtr(-4.0))
 # Chance at which a gray body passes for another: a tenth of what is promised of a status of 0.
 GRAY_CHANCE: Final = 1e-4
 TINY: Final = float(np.finfo(np.float64).tiny)
-
-
-def smooth_functions(time: Array, segment: Whole | None = None) -> smooth.Subspace:
-    """Largest smooth subspace that the data may choose, see `smooth.subspace`."""
-    return smooth.subspace(time, min(HIGHEST_ORDER, time.size // 4), segment=segment)
 
 
 def principal_ratio(scatter: Array, noise: Array) -> Array:
