@@ -25,7 +25,7 @@ from zarr.core.buffer import Buffer
 
 from dbthermal.schema import COORDINATES, Variable
 from dbthermal.store import _integrity as integrity
-from dbthermal.store._whole import replace, take, tree_to_disk, whole
+from dbthermal.store._whole import raised_signals, replace, take, tree_to_disk, whole
 
 Values = npt.NDArray[Any]
 
@@ -77,7 +77,7 @@ class Recording:
         self._attrs.update(frames_written=dict(self.frames), log_written=0)
         sizes = {**sizes, "band": len(bands), "time": chunk}
         # The store with empty arrays, on the disk before it has its name.
-        with whole(self.path, ".zarr") as draft:
+        with raised_signals(deferred=True), whole(self.path, ".zarr") as draft:
             if self.path.exists():
                 raise FileExistsError(f"There is something at '{path}'. Must be a new recording.")
             draft.mkdir()

@@ -113,21 +113,17 @@ def reserved(path: str | Path) -> Iterator[Path]:
     """
     path = texts.as_path(path).absolute()
     folder = path.with_name(f".{path.name}.draft")
+    lock = None
     with raised_signals(), _reasons(path, folder):
-        if (lock := _lock(folder, path)) is None:  # by this process already
-            yield folder
-            return
         try:
-            _remove_remains(folder, path)
+            with raised_signals(deferred=True):
+                if (lock := _lock(folder, path)) is not None:  # by this process already otherwise
+                    _remove_remains(folder, path)
             yield folder
         finally:
             if lock in _LOCKED:  # not in a fork
-                _remove_remains(folder, path)
-                with suppress(OSError):
-                    (folder / "holder").unlink()
-                    folder.rmdir()
-                _LOCKED.remove(lock)
-                os.close(lock)
+                with raised_signals(deferred=True):
+                    _release(lock, folder, path)
 
 
 def _restore(place: Path, path: Path) -> None:
@@ -169,6 +165,16 @@ def _lock(folder: Path, path: Path) -> int | None:
             finally:
                 if lock not in _LOCKED:
                     os.close(lock)
+
+
+def _release(lock: int, folder: Path, path: Path) -> None:
+    """Remove a locked folder with what was not renamed from it, and unlock it."""
+    _remove_remains(folder, path)
+    with suppress(OSError):
+        (folder / "holder").unlink()
+        folder.rmdir()
+    _LOCKED.remove(lock)
+    os.close(lock)
 
 
 def take(descriptor: int, *, shared: bool = False) -> bool:
@@ -276,36 +282,40 @@ class SignalExit(SystemExit):
 
 
 @contextmanager
-def raised_signals() -> Iterator[None]:
+def raised_signals(*, deferred: bool = False) -> Iterator[None]:
     """Raise SIGTERM and SIGHUP as `SignalExit` in the main thread, while a block lasts.
 
     A closed terminal sends SIGHUP; ``kill``, a service manager and a shutdown send SIGTERM. The
     first signal is raised, those after it are ignored: what is being closed must be left to end. A
     signal that the program handles by itself or ignores, as under ``nohup``, stays so.
+
+    Parameters
+    ----------
+    deferred : bool
+        Whether signals, of those that the program handles too, come only when the block has ended.
     """
     previous: dict[int, Any] = {}
     raised: list[int] = []
-    late: list[int] = []  # came while the handlers were put back
-    closing = False
+    late: list[int] = []  # came while they are deferred, or while the handlers are put back
 
     def end(number: int, _: FrameType | None) -> None:
-        if closing:
+        if deferred:
             late.append(number)
         elif not raised:
             raised.append(number)
             raise SignalExit(number)
 
     try:
-        # Only signals that would end the program, and only in the main thread, which gets them.
+        # Only in the main thread, which gets them, and only what the program does not ignore.
         if threading.current_thread() is threading.main_thread():
             for number in _ENDING:
-                if signal.getsignal(number) is signal.SIG_DFL:
+                handler = signal.getsignal(number)
+                if handler is signal.SIG_DFL or (deferred and callable(handler)):
                     previous[number] = signal.signal(number, end)
         yield
     finally:
-        closing = True
+        deferred = True
         for number, handler in previous.items():
             signal.signal(number, handler)
-        if not raised:
-            for number in late:
-                signal.raise_signal(number)
+        for number in late if not raised else ():
+            signal.raise_signal(number)
