@@ -169,6 +169,7 @@ def filled(
     sample = scene.sample()
     if not scene.apart:  # else the result's reflections are those of two places
         scenes.require_same_capture(scene, result, sample)
+    scene = replace(scene, rapid=scenes.find_rapid(scene, result, sample))
     if context.surroundings is None:
         level = scenes.find_level(scene, sample)
     else:

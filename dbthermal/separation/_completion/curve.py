@@ -5,6 +5,7 @@ from typing import Final
 
 import numpy as np
 
+from dbthermal._smooth import largest
 from dbthermal.separation._tiles import Array, Mask, Tile
 
 # Bins of time, at most, and frames in each, at least.
@@ -25,6 +26,20 @@ class Bins:
 
     signals: Array  # (band, bin, pixel) [K]
     frames: Array  # (bin, pixel)
+    time: Array  # (bin) [s]
+
+    def rapid(self, noise: float) -> Array:
+        """Standard deviation (pixel) [K] of the first band about a smooth curve, less its noise.
+
+        NaN in a pixel without frames in a bin.
+        """
+        smooth = largest(self.time).functions
+        rest = self.signals[0] - smooth @ (smooth.T @ self.signals[0])
+        variance = (rest**2).sum(axis=0) / (len(smooth) - smooth.shape[1])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            expected = noise**2 * np.mean(1.0 / self.frames, axis=0)
+            std = np.sqrt(np.maximum(variance - expected, 0.0))
+        return np.where(np.isinf(expected), np.nan, std)
 
 
 @dataclass(frozen=True)
@@ -42,7 +57,8 @@ def bins(tile: Tile, valid: Mask) -> Bins:
     starts = np.arange(0, max(tile.time.size - size // 2, 1), size)
     frames = np.add.reduceat(valid.astype(np.float64), starts, axis=0)
     total = np.add.reduceat(np.where(valid, tile.signals, 0.0), starts, axis=1)
-    return Bins(total / np.maximum(frames, 1.0), frames)
+    time = np.add.reduceat(tile.time, starts) / np.diff(starts, append=tile.time.size)
+    return Bins(total / np.maximum(frames, 1.0), frames, time)
 
 
 def curve(

@@ -62,6 +62,7 @@ class Scene:
     offset: Array  # deviation of a pixel's offset against the others, of the other bands [K]
     level: Level
     apart: bool  # the cameras do not see the same reflection in a pixel
+    rapid: float = np.inf  # standard deviation of rapid changes of the background [K]
 
     def mixture(self, source: int, places: Whole) -> Mixture:
         """Prior on the emissivities of pixels of one source."""
@@ -160,6 +161,15 @@ def require_same_capture(scene: Scene, result: xr.Dataset, sample: Sample) -> No
         )
 
 
+def find_rapid(scene: Scene, result: xr.Dataset, sample: Sample) -> float:
+    """Standard deviation [K] of rapid changes of the background, infinite if no pixel tells it."""
+    tile, valid, places = sample
+    std = curves.bins(tile, valid).rapid(tile.noise[0]) / (1.0 - scene.emissivity[0, places])
+    measured = (result["status"].values.ravel()[places] == 0) & (scene.source[places] == OWN)
+    std = std[measured & np.isfinite(std)]
+    return float(np.median(std)) if std.size else np.inf
+
+
 def stated(scene: Scene, surroundings: float | xr.DataArray, std: float) -> Level:
     """Level of stated surroundings, of all pixels or of each."""
     prior = schema.check_numbers(xr.DataArray(surroundings), "surroundings", "K")
@@ -192,7 +202,8 @@ def solve_statics(
         bend = np.sqrt(np.tensordot(prior.weight, (1.0 - prior.mean[:, 1:] / factor) ** 2, 1))
         bend = bend * level.fluctuation
         data = curves.curve(tile, means, scene.offset, stray**2, bend)
-        static = posterior.moments(tile, data, prior, level)
+        rapid = means.rapid(tile.noise[0]) / scene.rapid
+        static = posterior.moments(tile, data, prior, level, rapid)
         variance = posterior.fluctuation(tile, static, means, level.fluctuation)
     return static, np.maximum(variance, _LEAST[1] ** 2)
 
