@@ -36,12 +36,13 @@ from dbthermal.separation._tiles import Array, Pixels, Tile, Whole
 _WORSE: Final = 0.04
 # Steps of Gauss-Newton, at most, and the change of the level over its deviation that ends them [1].
 _STEPS, _SETTLED = 8, 0.02
-# Scatter of the logarithms of what pixels face; chance that an object itself changes rapidly [1].
-# With 0.5 gray bodies of 0.7, 0.9 and 0.95 are completed as 0.66, 0.90 and 0.93; without as 0.94.
-_SCATTER, _OTHERWISE = 0.5, 0.001
+_OTHERWISE: Final = 0.001  # chance that an object itself changes rapidly
 _NEGLIGIBLE: Final = 1e-9  # share of the largest weight
 _BOUNDS: Final = (0.01, 0.999)  # of the emissivities about which the model is linearised
 _VAGUE: Final = 1e6  # where nothing bounds the fluctuation of the background: its variance [K^2]
+
+
+Pair = tuple[Array, float]
 
 
 @dataclass(frozen=True)
@@ -83,13 +84,13 @@ class Moments(Pixels):
         return ratio, np.einsum("imp,mnp,jnp->ijp", change, self.emissivity_covariance, change)
 
 
-def moments(tile: Tile, data: Curve, prior: Mixture, level: Level, rapid: Array) -> Moments:
+def moments(tile: Tile, data: Curve, prior: Mixture, level: Level, rapid: Pair) -> Moments:
     """Posterior of the emissivities and of the background's level, steps 1 and 2.
 
-    The `rapid` changes (pixel) are a share of the background's; see `_of_rapid`.
+    Of the `rapid` changes see `_of_rapid`.
     """
     grid = prior.grid()  # (grid, pixel)
-    mirrored = _of_rapid(grid, rapid) if prior.weight.size > 1 else np.zeros_like(grid)
+    mirrored = _of_rapid(grid, *rapid) if prior.weight.size > 1 else np.zeros_like(grid)
     (points, pixels), size = grid.shape, len(tile.noise) + 1
     levels = np.stack([np.broadcast_to(array, pixels) for array in (level.signal, level.std)])
     arrays = (grid, prior.mean, prior.covariance, levels, mirrored, *vars(data).values())
@@ -117,14 +118,14 @@ def moments(tile: Tile, data: Curve, prior: Mixture, level: Level, rapid: Array)
     return Moments(point, mean[-1], spread, plain[:-1], covariance[:-1, :-1])
 
 
-def _of_rapid(grid: Array, rapid: Array) -> Array:
+def _of_rapid(grid: Array, rapid: Array, scatter: float) -> Array:
     """Log-likelihood (grid, pixel) of the rapid changes of a pixel, a share of the background's.
 
     A surface mirrors 1 - e_1 of them, and it may face calmer ones. That they are livelier is as
     probable as their logarithms scatter; or it is the object that changes rapidly.
     """
     with np.errstate(divide="ignore"):
-        excess = np.nan_to_num(np.maximum(np.log(rapid / (1.0 - grid)), 0.0)) / _SCATTER
+        excess = np.nan_to_num(np.maximum(np.log(rapid / (1.0 - grid)), 0.0)) / scatter
     return np.maximum(-0.5 * excess**2, math.log(_OTHERWISE))
 
 
