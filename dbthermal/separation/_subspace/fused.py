@@ -198,14 +198,42 @@ def _scatters(model: Model, work: Work, record: Any, matrices: Any) -> None:
     if np.isnan(work.material[2]) and not _bent(model, work, frames):
         _straighten(work, bands, frames)
         pixel.scatter(model, work)
+    _straight_noise(model, work, work.turned, work.axis)
     for place in range(3):
         order = record.order
         if place > 0:
             order = max(1, orders - reflection_ratio.FEWER * (2 - place))
-        for m in range(bands):
-            kernels.copy(work.scatter[order - 1, m], matrices[place, m])
-            matrices[place, m, m] -= frames - model.steps - order
         record.freedom[place] = frames - model.steps - order
+        for m in range(bands):
+            for k in range(bands):
+                noise = record.freedom[place] * work.turned[m, k]
+                matrices[place, m, k] = work.scatter[order - 1, m, k] - noise
+
+
+@inlined
+def _straight_noise(model: Model, work: Work, covariance: Array, rate: Array) -> None:
+    r"""Covariance (band, band) of the whitened noise of straightened signals, in place.
+
+    The bend is that of a noisy background. With :math:`r_m = (1 - e_m) u_m'(y) / s_m` its noise is
+    :math:`\sum_k r_k n_k / E` of white :math:`n_k` and :math:`E = \sum_k r_k^2`. It enters band m
+    by :math:`h_m = r_m - (1 - e_m) u_1'(y) / s_m`, which leaves :math:`\delta_{mk} - (h_m r_k +
+    r_m h_k - h_m h_k) / E`. That is too little to be seen in a pixel, but not in many.
+    """
+    level, energy, physical = kernels.mean(work.background[: work.first.size]), 0.0, True
+    slope = kernels.exact(kernels.response(model.tables, 0), level)[1]
+    for m in range(rate.size):
+        emissivity, response = work.emissivity[m], kernels.response(model.tables, m)
+        rate[m] = (1.0 - emissivity) / model.noise[m] * kernels.exact(response, level)[1]
+        energy += rate[m] ** 2
+        physical &= 0.0 < emissivity < 1.0
+    for m in range(rate.size):
+        for k in range(rate.size):
+            covariance[m, k] = 1.0 if m == k else 0.0
+            if physical and energy > 0.0:
+                first = rate[m] - (1.0 - work.emissivity[m]) / model.noise[m] * slope
+                second = rate[k] - (1.0 - work.emissivity[k]) / model.noise[k] * slope
+                shared = first * rate[k] + rate[m] * second - first * second
+                covariance[m, k] -= shared / energy
 
 
 @inlined
