@@ -265,8 +265,8 @@ def _unused(options: argparse.Namespace) -> dict[str, str]:
         return {f"with {suffix}": "pixel region variable" if suffix == ".nc" else "pixel region"}
     if options.command != "separate":
         return {}
-    if options.correction:
-        return {"with --correction": "method emissivity"}
+    if options.correction or options.corrected_by_camera:
+        return {"with --correction or --corrected-by-camera": "method emissivity"}
     aligned = {"without --correction, for the capture is aligned": "register offset"}
     names = "surroundings outdoors background_ratio prior workers"
     completing = {"with --method: 'dbthermal complete'": names}
@@ -385,7 +385,6 @@ def _shifts(dataset: xr.Dataset) -> dict[str, Any]:
 def _shares(flags: xr.DataArray) -> dict[str, float]:
     """Share of the values without a flag, and of each flag found."""
     shares = {"no_flag": float((flags.values == 0).mean())}
-    for name in str(flags.attrs["flag_meanings"]).split():
-        share = float(schema.has_flag(flags, name).mean())
-        shares |= {name: share} if share else {}
-    return {name: round(share, 6) for name, share in shares.items()}
+    names = str(flags.attrs["flag_meanings"]).split()
+    shares |= {name: float(schema.has_flag(flags, name).mean()) for name in names}
+    return {name: round(share, 6) for name, share in shares.items() if share or name == "no_flag"}
