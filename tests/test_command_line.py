@@ -539,6 +539,10 @@ ROWS = f"""
  --register none -o x.zarr -> Missing time offset .* no rapid change that both bands see
 separate scene.zarr response.zarr -o x.zarr -> 'separate --correction' takes raw counts
 separate response.zarr aligned.zarr -o x.zarr -> Exchanged with the response
+separate scene.zarr response.zarr --correction response.zarr -o x.zarr -> calibrate --corr\\S+$
+import response.zarr -o x.zarr -> of stage 'response'. Must be of stage 'capture'
+info result.zarr scene.zarr -> Invalid list of 2 arrays. Must be one file or store.
+info a.tif b.tif --clock 10 -> Unordered files: .* Must be of one camera, and rise
 align scene.zarr -o x.zarr -> Invalid capture .* of stage 'capture'. Must be of stage 'corrected'
 correct scene.zarr response.zarr -o x.zarr -> of stage 'response'. Must be of stage 'corr
 separate aligned.zarr response.zarr --offset 0 -o x.zarr -> Unused option --offset.
