@@ -181,8 +181,8 @@ bring two cameras onto one clock and one pixel grid
 corrected.zarr -o aligned.zarr
 corrected.zarr --register none --offset 0 -o aligned.zarr
 
-separate steps.separate capture response --correction --register --offset --method \
-    --emissivity --surroundings --outdoors --background-ratio --prior --workers --output
+separate steps.separate capture response --correction --corrected-by-camera --register --offset \
+    --method --emissivity --surroundings --outdoors --background-ratio --prior --workers --output
 separate emission and reflection: temperatures, emissivities, deviations, status
 aligned.zarr response.zarr -o result.zarr
 scene.zarr response.zarr --correction nuc.zarr -o result.zarr
@@ -233,9 +233,11 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print the usage and the message, and exit."""
-        names = ", ".join(self._option_string_actions)
+        names = "': choose from " + ", ".join(self._option_string_actions)
         for wrong in re.findall(r"unrecognized arguments: (--\S+)", message):
-            message += suggestion(f"'{wrong}': choose from {names}")
+            message += suggestion(f"'{wrong}{names}")
+        if self.epilog and re.match("unrecognized arguments: [^-]|the following", message):
+            message += f". Must be as in: {self.epilog.splitlines()[1].strip()}"
         super().error(message + suggestion(message))
 
     def parse_known_args(self, *arguments: Any, **named: Any) -> Any:
@@ -286,10 +288,8 @@ def _options(argument: str, kind: str, text: str) -> dict[str, Any]:
     if argument.startswith("-"):
         values = _VALUES.get(argument, name.upper()).split()
         options["metavar"] = tuple(values) if len(values) > 1 else values[0]
-    if "!" in kind:
-        options["required"] = True
-    if "&" in kind:
-        options |= {"action": "append", "default": []}
+    options |= {"required": True} if "!" in kind else {}
+    options |= {"action": "append", "default": []} if "&" in kind else {}
     if default:
         options |= {"default": _KINDS[name](default), "help": f"{text} ({default})"}
     return options

@@ -252,7 +252,8 @@ def test_the_demonstration_runs_as_it_is_printed(tmp_path: Path, option: list[st
         texts.append(out)
     assert {"report.html", "look.ipynb"} <= {path.name for path in (tmp_path / "try-it").iterdir()}
     result = store.open_dataset(tmp_path / "try-it" / "result.zarr")
-    assert result.attrs["origin"] == "simulated"
+    assert result.attrs["origin"] == "simulated"  # as the stacks say by themselves
+    assert store.open_dataset(tmp_path / "try-it/response.zarr").attrs["origin"] == "simulated"
     # The answer comes first, and holds the truth: 22 to 60 degC, a third of it measured or more.
     head = re.search(r"Object from (\S+) to (\S+) degC, typically \+- (\S+) K \(noise", texts[2])
     assert head, texts[2]
@@ -525,6 +526,8 @@ def test_missing_extras_are_named(results: Path, library: str, extra: str, comma
 
 
 ONE = f"import a.tif b.tif {' '.join(STATED)}"
+EXCHANGED = f"""{ONE.replace("a.tif b.tif", "b.tif a.tif")} --offset 0 -o ba.zarr; separate ba.zarr
+ response.zarr --correction nuc.zarr --register none --offset 0 -o no.zarr""".replace("\n", "")
 SWEEP = f"calibrate {' '.join(STATED)} --at 5C a5.tif b5.tif --at 70C a70.tif b70.tif -o x.zarr"
 STORES = "result.zarr aligned.zarr response.zarr"
 ROWS = f"""
@@ -536,6 +539,10 @@ ROWS = f"""
  --register none -o x.zarr -> Missing time offset .* no rapid change that both bands see
 separate scene.zarr response.zarr -o x.zarr -> 'separate --correction' takes raw counts
 separate response.zarr aligned.zarr -o x.zarr -> Exchanged with the response
+separate scene.zarr response.zarr --correction response.zarr -o x.zarr -> calibrate --corr\\S+$
+import response.zarr -o x.zarr -> of stage 'response'. Must be of stage 'capture'
+info result.zarr scene.zarr -> Invalid list of 2 arrays. Must be one file or store.
+info a.tif b.tif --clock 10 -> Unordered files: .* Must be of one camera, and rise
 align scene.zarr -o x.zarr -> Invalid capture .* of stage 'capture'. Must be of stage 'corrected'
 correct scene.zarr response.zarr -o x.zarr -> of stage 'response'. Must be of stage 'corr
 separate aligned.zarr response.zarr --offset 0 -o x.zarr -> Unused option --offset.
@@ -554,6 +561,14 @@ separate aligned.zarr response.zarr --method calibrated --emissivity 1 -o x.zarr
  -> Must be one for each
 separate aligned.zarr response.zarr --offset nan -o x.zarr -> --offset: Invalid number 'nan'
 plan --noise 30mK -> argument --noise: Invalid number '30mK'. Must be digits
+plan --noise 30 -> Invalid noise 30 K. Must be below 5 K: 30 mK are 0.03 K
+calibrate a5.tif b5.tif -o x.zarr -> arguments: a5.tif b5.tif. .* dbthermal calibrate --at 10C a
+calibrate a5.tif b5.tif -> required: -o/--output. .* dbthermal calibrate --at 10C a10.tif
+separate scene.zarr response.zarr --corrected-by-camera --register none --offset 0 -o camera.zarr
+ -> Warning: Fixed pattern of
+separate scene.zarr response.zarr --correction nuc.zarr --corrected-by-camera -o x.zarr
+ -> Invalid correction of gain and offset: both
+{EXCHANGED} -> Warning: Counts of bands .* are files of the bands exchanged
 calibrate --at 5C --clock 10 -o x.zarr -> Invalid 0 files
 calibrate -o x.zarr -> Missing source. Must be one of --at, --blackbody
 demo x --side -> unrecognized arguments: --side Did you mean '--side-by-side'
@@ -603,6 +618,7 @@ calibrate --clock 10 -o x ->
 align corrected.zarr --offset 0 --search 5 -o x.zarr -> search --offset
 separate aligned.zarr response.zarr --method apparent --workers 2 -o x -> workers --met
 separate aligned.zarr response.zarr --emissivity 1 1 -o x -> emissivity --method calibrated
+separate scene.zarr response.zarr --corrected-by-camera --method subspace -o x -> method --corr
 export result.zarr --pixel 1 1 -o x.tif -> pixel .tif
 export result.zarr --variable emissivity -o x.nc -> variable .nc
 """.strip()

@@ -188,6 +188,10 @@ CASES: list[tuple[Call, str]] = [
         r"emissivity 1.2 in band '9.5', pixel \(0, 0\). Must lie in \(0, 1\)",
     ),
     (lambda: calibrated(emissivity=emissivity_of(0.8, 0.8)), "same in both bands. Must differ"),
+    (
+        lambda: calibrated(emissivity=0.9),
+        r"a DataArray of dims \('band',\) .* such as xr.DataArray",
+    ),
     *(
         (lambda drift=drift: separation.SubspaceSettings(drift), f"background_drift {drift} K")
         for drift in (-1.0, np.nan, np.inf)

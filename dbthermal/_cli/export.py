@@ -95,6 +95,7 @@ def _film(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dict[s
 
     array = result[options.variable]
     about = {"variable": array.name, "units": array.attrs.get("units"), **provenance(options)}
+    about |= schema.origin(result.attrs)
     values = array.values.astype(np.float32) if array.dtype.kind == "f" else array.values
     tifffile.imwrite(path, values, photometric="minisblack", description=json.dumps(about))
     return {"shape": list(values.shape), "dtype": str(values.dtype), "units": about["units"]}
@@ -157,11 +158,10 @@ def report(options: argparse.Namespace) -> dict[str, Any]:
     from dbthermal import reporting  # noqa: PLC0415 - optional
 
     result, *shown = _shown(options, "separated")
-    regions = _regions(result, options.region)
     named = {name: vars(options)[name] for name in ("title", "logo") if vars(options)[name]}
     today = f"reported on {datetime.now().astimezone():%Y-%m-%d}"
-    named["author"] = ", ".join(filter(None, [options.author, today]))
-    reporting.report(result, options.output, *shown, regions=regions, **named)
+    named["author"], regions = ", ".join(filter(None, [options.author, today])), options.region
+    reporting.report(result, options.output, *shown, regions=_regions(result, regions), **named)
     return {str(options.output): {"bytes": options.output.stat().st_size}}
 
 

@@ -58,15 +58,15 @@ def opened(path: Path) -> xr.Dataset:
 def staged(options: argparse.Namespace, **stages: str) -> list[xr.Dataset]:
     """Stores that arguments name, each of a stage of `schema`, or of one of several: ``a|b``."""
     datasets = {name: opened(getattr(options, name)) for name in stages}
-    for name, wanted in stages.items():
-        actual = stage_of(datasets[name])
-        if actual not in wanted.split("|"):
-            fitting = [argument for argument in stages if actual in stages[argument].split("|")]
-            hint = f" Exchanged with the {fitting[0]}?" if fitting else ""
-            label = f"{name} '{getattr(options, name)}' of stage '{actual}'"
-            stage = wanted.partition("|")[0]
-            rule = f"Must be of stage '{stage}', as from: dbthermal {_MADE_BY[stage]}"
-            raise ValueError(f"Invalid {label}. {rule}.{hint}")
+    actual = {name: stage_of(dataset) for name, dataset in datasets.items()}
+    wrong = [name for name, wanted in stages.items() if actual[name] not in wanted.split("|")]
+    for name in wrong:
+        fitting = [argument for argument in wrong if actual[name] in stages[argument].split("|")]
+        hint = f" Exchanged with the {fitting[0]}?" if fitting else ""
+        label = f"{name} '{getattr(options, name)}' of stage '{actual[name]}'"
+        stage = stages[name].partition("|")[0]
+        rule = f"Must be of stage '{stage}', as from: dbthermal {_MADE_BY[stage]}"
+        raise ValueError(f"Invalid {label}. {rule}.{hint}")
     return [*datasets.values()]
 
 
@@ -99,7 +99,7 @@ def recording(paths: list[Path], options: argparse.Namespace, camera: int = 0) -
     # Files of the kinds that make one recording together.
     several = kind in {"FLIR", "TIFF"}
     if len(paths) > 1 and not several:
-        raise ValueError(f"Invalid list of {len(paths)} {kind}. Must be one file of all frames.")
+        raise ValueError(f"Invalid list of {len(paths)} {kind}. Must be one file or store.")
     with on_disk(_room(options)):  # films that are large
         movie = reader(paths if several else paths[0], **stated).isel(selected)
     if not all(movie.sizes.values()):
@@ -143,7 +143,7 @@ def between(options: argparse.Namespace, name: str, most: int | None = None) -> 
 def capture(paths: list[Path], options: argparse.Namespace, offset: Any) -> xr.Dataset:
     """Capture of two bands or more: a store, or the files of each camera, with '+' between."""
     if len(paths) == 1 and (paths[0].suffix == ".zarr" or _is_store(paths[0])):
-        return opened(paths[0])
+        return staged(argparse.Namespace(capture=paths[0]), capture="capture|corrected")[0]
     number = len(options.bands or "ab")
     cameras = [[*group] for is_plus, group in groupby(paths, PLUS.__eq__) if not is_plus]
     if PLUS not in paths and len(paths) in {2, number}:
@@ -265,8 +265,8 @@ def _unused(options: argparse.Namespace) -> dict[str, str]:
         return {f"with {suffix}": "pixel region variable" if suffix == ".nc" else "pixel region"}
     if options.command != "separate":
         return {}
-    if options.correction:
-        return {"with --correction": "method emissivity"}
+    if options.correction or options.corrected_by_camera:
+        return {"with --correction or --corrected-by-camera": "method emissivity"}
     aligned = {"without --correction, for the capture is aligned": "register offset"}
     names = "surroundings outdoors background_ratio prior workers"
     completing = {"with --method: 'dbthermal complete'": names}
@@ -385,7 +385,6 @@ def _shifts(dataset: xr.Dataset) -> dict[str, Any]:
 def _shares(flags: xr.DataArray) -> dict[str, float]:
     """Share of the values without a flag, and of each flag found."""
     shares = {"no_flag": float((flags.values == 0).mean())}
-    for name in str(flags.attrs["flag_meanings"]).split():
-        share = float(schema.has_flag(flags, name).mean())
-        shares |= {name: share} if share else {}
-    return {name: round(share, 6) for name, share in shares.items()}
+    names = str(flags.attrs["flag_meanings"]).split()
+    shares |= {name: float(schema.has_flag(flags, name).mean()) for name in names}
+    return {name: round(share, 6) for name, share in shares.items() if share or name == "no_flag"}

@@ -43,8 +43,8 @@ _VIEW: Final = (2, 4)  # rows and columns by which cameras side by side see the 
 _PARALLAX: Final = 3  # further columns by which they see its reflections apart
 
 _NEXT: Final = """\
-dbthermal import a.tif b.tif --simulated --bands 8-14 9.5 --clock 10 --offset 0 -o scene.zarr
-dbthermal calibrate {sweep} --simulated --bands 8-14 9.5 --clock 10 -o response.zarr \
+dbthermal import a.tif b.tif --bands 8-14 9.5 --clock 10 --offset 0 -o scene.zarr
+dbthermal calibrate {sweep} --bands 8-14 9.5 --clock 10 -o response.zarr \
 --correction-output nuc.zarr
 dbthermal separate scene.zarr response.zarr --correction nuc.zarr{views} -o result.zarr
 dbthermal report result.zarr -o report.html
@@ -74,9 +74,10 @@ def demo(options: argparse.Namespace) -> dict[str, Any]:
     for path in (path for path in paths if path.exists()):
         raise FileExistsError(f"There is something at '{path}'. Must be a new folder.")
     folder.mkdir(parents=True, exist_ok=True)
+    about = f"origin: {_SCENE}"  # which `readers.tiff` takes over
     for path, stack in paths.items():
         with store.whole(path, ".tif") as draft:
-            tifffile.imwrite(draft, stack, photometric="minisblack", description=_SCENE)
+            tifffile.imwrite(draft, stack, photometric="minisblack", description=about)
     sweep = " ".join(f"--at {step}C a{step}.tif b{step}.tif" for step in _CELSIUS)
     views = " --register translation" if options.side_by_side else " --register none --offset 0"
     commands = _NEXT.format(sweep=sweep, views=views).splitlines()
@@ -105,8 +106,7 @@ def _demo_stacks(rig: simulation.Rig, rng: np.random.Generator, *, apart: bool) 
     # Raw counts of two detectors, as they show the scene and the blackbody.
     detector = simulation.pattern(rig, _SHAPE, rng)
     shown = simulation.capture(xr.concat(films, dim="band"), detector)
-    kelvin = np.array(_CELSIUS) + zero_Celsius
-    movies = simulation.blackbody_movies(rig, kelvin, _STILL, detector, rng)
+    movies = simulation.blackbody_movies(rig, np.add(_CELSIUS, zero_Celsius), _STILL, detector, rng)
     stacks = dict(zip("ab", shown["counts"].values, strict=True))
     for name, sweep in zip("ab", movies["counts"].values, strict=True):
         stacks |= {f"{name}{step}": film for step, film in zip(_CELSIUS, sweep, strict=True)}
@@ -136,6 +136,7 @@ def calibrate(options: argparse.Namespace) -> dict[str, Any]:
     named = leaves([options.at, options.blackbody, options.sweep])
     paths = [str(leaf) for leaf in named if isinstance(leaf, str | Path) and leaf != PLUS]
     response.attrs["blackbody"] += f"; of {', '.join(paths)}"
+    response.attrs |= schema.origin(blackbody.attrs)
     summary = files.saved(response, options)
     if fitted is not None and options.correction_output:
         summary |= files.saved(fitted, options, options.correction_output)
@@ -161,20 +162,26 @@ def _blackbody(options: argparse.Namespace) -> xr.Dataset:
         good = np.arange(still.sizes["time"])
         if "exposure_time" in still:  # padded and damaged frames have none
             good = np.flatnonzero(still["exposure_time"].notnull().all("band"))
-        movie = still["counts"].isel(time=good[frames]).load()
-        movie = movie.drop_vars("time").rename(time="frame")
-        movies.append(movie.expand_dims(temperature=[temperature]))
+        movie = still[["counts"]].isel(time=good[frames]).load().drop_vars("time")
+        movies.append(movie.rename(time="frame").expand_dims(temperature=[temperature]))
     # All temperatures have the frames of the shortest recording.
     number = min(movie.sizes["frame"] for movie in movies)
-    counts = xr.concat([movie.isel(frame=slice(number)) for movie in movies], dim="temperature")
-    counts = counts.transpose("band", "temperature", "frame", "y", "x").sortby("temperature")
-    return counts.to_dataset(name="counts")
+    joined: Any = {"dim": "temperature", "combine_attrs": lambda them, **_: schema.origin(*them)}
+    counts = xr.concat([movie.isel(frame=slice(number)) for movie in movies], **joined)
+    return counts.transpose("band", "temperature", "frame", "y", "x").sortby("temperature")
 
 
 def correct(options: argparse.Namespace) -> dict[str, Any]:
     """Command `correct`."""
     stages = {"correction": "correction"} if options.correction else {}
     raw, *fitted = files.staged(options, capture="capture|corrected", **stages)
+    named = {**accepted(correction.correct_capture, options), "shutter": not options.no_shutter}
+    gain = _gain(options, raw, fitted)
+    return files.saved(correction.correct_capture(raw, gain, lazy=True, **named), options)
+
+
+def _gain(options: argparse.Namespace, raw: xr.Dataset, fitted: list[xr.Dataset]) -> xr.Dataset:
+    """Gain and offset of each pixel: of a file, or corrected by the cameras."""
     by_camera = options.corrected_by_camera
     records = raw.attrs.get("files", {}).values()
     # Planck constants of the maker hold for all pixels: such a camera has corrected its offsets.
@@ -184,11 +191,7 @@ def correct(options: argparse.Namespace) -> dict[str, Any]:
         rule = "Must be the file of 'dbthermal calibrate --correction-output nuc.zarr' or, only if "
         rule += "the cameras correct gain and offset themselves, --corrected-by-camera"
         raise ValueError(f"Invalid correction of gain and offset: {sources}. {rule}.")
-    gain = fitted[0].load() if fitted else correction.corrected_by_camera(raw)
-    named = accepted(correction.correct_capture, options)
-    shutter = not options.no_shutter
-    corrected = correction.correct_capture(raw, gain, lazy=True, shutter=shutter, **named)
-    return files.saved(corrected, options)
+    return fitted[0].load() if fitted else correction.corrected_by_camera(raw)
 
 
 def align(options: argparse.Namespace) -> dict[str, Any]:
@@ -216,26 +219,24 @@ def _aligning(options: argparse.Namespace, capture: xr.Dataset) -> dict[str, Any
 def separate(options: argparse.Namespace) -> dict[str, Any]:
     """Command `separate`."""
     # Inputs of the stages that the way needs.
-    stages = {"capture": "corrected", "response": "response"}
-    if options.correction:
-        stages |= {"capture": "capture|corrected", "correction": "correction"}
-        options.register = options.register or "homography"
+    is_raw = bool(options.correction or options.corrected_by_camera)
+    stages = {"capture": "capture|corrected" if is_raw else "corrected", "response": "response"}
+    stages |= {"correction": "correction"} if options.correction else {}
     source, response, *fitted = files.staged(options, **stages)
     response.load()
-    progress = {"progress": sys.stderr.isatty()}
-    if options.correction:  # all steps of a raw capture, by rows
-        named = {"target": options.output, "provenance": files.provenance(options)}
-        named["registration"] = None if options.register == "none" else options.register
-        named["aligning"] = _aligning(options, source)
-        named["separating"] = accepted(separation.separate, options) | progress
-        scene.separate_capture(source, fitted[0].load(), response, **named)
+    named = accepted(separation.run if options.method else separation.separate, options)
+    named["progress"] = sys.stderr.isatty()
+    if is_raw:  # all steps of a raw capture, by rows
+        options.register = options.register or "homography"
+        steps: Any = {"target": options.output, "provenance": files.provenance(options)}
+        steps["registration"] = None if options.register == "none" else options.register
+        steps |= {"aligning": _aligning(options, source), "separating": named}
+        scene.separate_capture(source, _gain(options, source, fitted), response, **steps)
     elif options.method is None:  # the default call, in memory
         notes = [note for data in (source, response) for note in data.attrs.get("warnings", [])]
-        named = accepted(separation.separate, options) | progress
         result = separation.separate(source.load(), response, **named)
         return files.saved(warned(result, *notes, *hardly_measured(result)), options)
     else:  # a single method, by rows
-        named = accepted(separation.run, options) | progress
         if options.emissivity:
             axis = {"band": source["band"].values}
             if len(options.emissivity) != len(axis["band"]):
@@ -272,8 +273,8 @@ def foreseen(
     outlines = [summary.get("would_be", {}), *inputs.values()]
     sized = [it["sizes"] for it in outlines if "time" in it.get("sizes", {})]
     if sized and (stage := _OUTPUTS.get(options.command)):
-        lengths = {"axis": 2, "cause": len(schema.CAUSES), "other_band": sized[0]["band"]}
-        lengths |= sized[0]
+        lengths = {**sized[0], "axis": 2, "cause": len(schema.CAUSES)}
+        lengths["other_band"] = lengths["band"]
         summary["would_write_bytes_at_most"] = sum(
             math.prod(lengths[dim] for dim in variable.dims) * np.dtype(variable.dtype).itemsize
             for variable in {**schema.STAGES[stage], **schema.OPTIONAL[stage]}.values()
@@ -283,10 +284,11 @@ def foreseen(
         summary["free_bytes"] = shutil.disk_usage(place).free
     if options.command == "separate":
         sizes = inputs[str(options.capture)].get("sizes", {})
-        memory = BASE + scene.SAMPLE * math.prod(sizes.get(dim, 0) for dim in ("time", "y", "x"))
-        row = BASE + scene.ROW * math.prod(sizes.get(dim, 0) for dim in ("time", "x"))
-        most = max(3e9, row) if options.correction else 2e9 if options.method else math.inf
-        summary["memory_at_most_GB"] = round(min(memory, most) / 1e9, 1)
+        time, y, x = (sizes.get(dim, 0) for dim in ("time", "y", "x"))
+        most = 2e9 if options.method else math.inf
+        if options.correction or options.corrected_by_camera:
+            most = max(3e9, BASE + scene.ROW * time * x)
+        summary["memory_at_most_GB"] = round(min(BASE + scene.SAMPLE * time * y * x, most) / 1e9, 1)
     return summary
 
 
@@ -296,9 +298,8 @@ def plan(options: argparse.Namespace) -> dict[str, Any]:
     table = emissivity.embedded_table()
     if options.materials:
         names = table["material"].values.tolist()
-        for name in options.materials:
-            if name not in names:
-                raise ValueError(f"Unknown material '{name}'. Must be one of {names}.")
+        for name in (name for name in options.materials if name not in names):
+            raise ValueError(f"Unknown material '{name}'. Must be one of {names}.")
         table = table.sel(material=options.materials)
     # Plan of the capture, and its best filter by material.
     level = {"level": SKY_LEVEL} if options.outdoors else {}

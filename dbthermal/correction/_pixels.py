@@ -30,9 +30,9 @@ _WHITE, _PATTERN = 0.7, 5.0
 _SMOOTH: Final = 1.0 + 0.75**2  # variance of a new pattern with its smooth part, over that without
 _UNCORRECTED: Final = (
     "Fixed pattern of {} times the noise of a frame: the pixels differ from each other as without "
-    "a correction of gain and offset, or with an old one. Must be below 5: correct the raw capture "
-    "with gain and offset of these cameras, as of 'calibrate', renewed since the shutter's last "
-    "event; no flag and no error bar has this error"
+    "a correction of gain and offset, with an old one, or with files of bands exchanged. Must be "
+    "below 5: correct the raw capture with gain and offset of these cameras, as of 'calibrate', "
+    "renewed since the shutter's last event; no flag and no error bar has this error"
 )
 _BLOCK = 8_000_000  # samples of a block
 

@@ -167,12 +167,10 @@ def library_mixture(bands: Iterable[str]) -> xr.Dataset:
     0.87
     """
     names = [str(band) for band in bands]
-    unknown = [name for name in names if name not in FILTERS]
-    if unknown or len(set(names)) < len(names):
-        raise ValueError(
-            f"Invalid bands {names} of the library's emissivities. Must be of {list(FILTERS)}, "
-            "each once, when the capture is made; or give a prior on the emissivities."
-        )
+    if not {*names} <= {*FILTERS} or len({*names}) < len(names):
+        label = f"Invalid bands {names} of the library's emissivities. Must be of {[*FILTERS]}"
+        rule = "each once, when the capture is made; or give a prior on the emissivities"
+        raise ValueError(f"{label}, {rule}.")
     titles, rows = _packaged(_MIXTURE)
     count, values = len(FILTERS), _text.numbers(rows, len(titles), _MIXTURE)
     covariance = np.zeros((len(values), count, count))
@@ -237,8 +235,7 @@ def _average(
     wavelength: Array, emissivity: Array, band: Band, temperature: float, whole: float
 ) -> tuple[float, float]:
     """Planck-weighted mean [1] of a piecewise linear spectrum by Gauss's rule, and its coverage."""
-    lower = max(band.lower, float(wavelength[0]))
-    upper = min(band.upper, float(wavelength[-1]))
+    lower, upper = max(band.lower, float(wavelength[0])), min(band.upper, float(wavelength[-1]))
     if upper <= lower:
         return np.nan, 0.0
     nodes_inside = wavelength[(wavelength > lower) & (wavelength < upper)]
@@ -260,6 +257,7 @@ def _dataset(materials: list[str], names: list[str], values: Array, coverage: Ar
 
 
 _TEMPERATURE = 300.0  # of the object, at which a noise is stated [K]
+_LIMIT = 5.0  # of a noise [K]; thermopile arrays have 1 K, and the quietest cameras 10 mK
 
 
 def filter_noise(netd: float, bands: Bands) -> xr.DataArray:
@@ -277,7 +275,7 @@ def filter_noise(netd: float, bands: Bands) -> xr.DataArray:
         Noise-equivalent temperature difference in the first band [K].
     bands : mapping or iterable of Band or str
         Bands, or names of `bands.FILTERS`, each once; the first is the one that `netd` belongs to.
-        TypeError or ValueError for other bands, or an `netd` that is not positive.
+        TypeError or ValueError for other bands, or an `netd` that is not in (0, 5) K.
 
     Examples
     --------
@@ -286,6 +284,8 @@ def filter_noise(netd: float, bands: Bands) -> xr.DataArray:
     """
     chosen = chosen_bands(bands)
     netd = _numbers.real_number("netd [K]", netd, _numbers.POSITIVE)
+    if netd >= _LIMIT:
+        raise ValueError(f"Invalid noise {netd:g} K. Must be below {_LIMIT:g} K: 30 mK are 0.03 K.")
     slopes = np.array([float(band.slope(_TEMPERATURE)) for band in chosen])
     noise, axes = netd * slopes[0] / slopes, {"band": [band.name for band in chosen]}
     attrs = {"units": "K", "long_name": "noise-equivalent temperature difference"}

@@ -98,7 +98,7 @@ def files(path: Paths, reader: str) -> list[Path]:
         if len(before) == len(after) and after <= before:
             state = "do not rise" if after != before else "are those of the file before, or none"
             label = f"Unordered files: the numbers of '{file.name}' {state}"
-            rule = "Must rise, not in the order of text, frame1, frame10, frame2"
+            rule = "Must be of one camera, and rise: not frame1, frame10, frame2"
             raise ValueError(f"{label}. {rule}: $(ls -v frame*.png).")
     for file in paths:
         actual = "" if reader == "raw" else reader_of(file)

@@ -55,6 +55,7 @@ _STATED: Final = r"""(?i)\b(?:{})["']?\s*[:=]\s*["']?({})"""
 _NUMBER: Final = r"[0-9]+\.?[0-9]*(?:e[+-]?[0-9]+)?"
 _INTERVAL: Final = re.compile(_STATED.format("finterval|frame[ _]?interval|TimeIncrement", _NUMBER))
 _TIMES: Final = re.compile(_STATED.format("DeltaT", _NUMBER))
+_SIMULATED: Final = re.compile(_STATED.format("origin", "simulated"))
 _RATE: Final = re.compile(_STATED.format("fps|frame[ _]?rate", _NUMBER))
 _TIME_UNIT: Final = re.compile(_STATED.format("tunit|TimeIncrementUnit|DeltaTUnit", r"\w+"))
 _OVER_TIME: Final = re.compile("[TZIQ]?YX")  # axes as tifffile names them; slices are ImageJ's own
@@ -65,8 +66,8 @@ def tiff(
 ) -> xr.Dataset:
     """Counts of a TIFF or BigTIFF stack, or of one TIFF or PNG a frame, in 16 bits.
 
-    These do not tell the unit, and rarely the time of frames. An interval of frames, or times, in a
-    description of ImageJ or OME must agree with the clock, and are taken without it.
+    These do not tell the unit, and rarely times. An interval of frames, or times, in a description
+    of ImageJ or OME must agree with the clock, or serves as one; "origin: simulated" is kept.
 
     Parameters
     ----------
@@ -119,10 +120,9 @@ def tiff(
     _recording.check_unit(unit, name)
     # Pages of one size, and the memory that they take.
     pages = [page for file in paths for page in _pages(file)]
-    for page in pages:
-        if page.shape != pages[0].shape:
-            label = f"Invalid page of {page.shape} in '{page.path.name}'"
-            raise ValueError(f"{label}. Must be {pages[0].shape}, as the first.")
+    for page in (page for page in pages if page.shape != pages[0].shape):
+        label = f"Invalid page of {page.shape} in '{page.path.name}'"
+        raise ValueError(f"{label}. Must be {pages[0].shape}, as the first.")
     shape = (sum(page.images for page in pages), *pages[0].shape)
     stored = sum(length for page in pages for _, length in page.spans)
     _recording.check_memory(shape, memory, name, stored)
@@ -139,10 +139,9 @@ def tiff(
         seconds = numbers * seconds[1]
     # Pixels, from the places that the pages state.
     counts, at = empty(shape, np.uint16), 0
-    flat = counts.reshape(-1)
     for page in pages:
         for values in _values(page):
-            flat[at : at + values.size] = values
+            counts.reshape(-1)[at : at + values.size] = values
             at += values.size
             release()
     _recording.check_present(counts, sorted({v for page in pages for v in page.missing}), name)
@@ -151,9 +150,11 @@ def tiff(
         label = f"'{paths[twins[0] - 1].name}' and '{paths[twins[0]].name}', {len(twins)} in all"
         sentences.append(f"Same counts in {label}. Must be different frames: is one a copy?")
     order = " and ".join(sorted({_recording.ORDERS[page.order] for page in pages}))
-    decided = {"byte_order": order, "byte_order_by": "header"}
     form = "PNG" if pages[0].codec == "png" else "TIFF"
-    return _recording.clocked(counts, seconds, name, *sentences, format=form, **decided)
+    decided = {"byte_order": order, "byte_order_by": "header", "format": form}
+    if any(_SIMULATED.search(page.description) for page in pages):
+        decided["origin"] = "simulated"
+    return _recording.clocked(counts, seconds, name, *sentences, **decided)
 
 
 def _times(text: str, frames: int, clock: Clock | None, name: str) -> tuple[Array, list[str]]:
@@ -315,8 +316,7 @@ def _page(page: Any, path: Path, order: str, number: int) -> _Page:
     if codec and len(spans) != -(-shape[0] // rows):
         label = f"{len(spans)} strips of page {number}"
         raise ValueError(f"Truncated: {label}. Must be of {rows} rows.")
-    form = (codec, rows, predictor == 2)
-    return _Page(path, shape, 1, order, spans, _no_data(page, number), *form)
+    return _Page(path, shape, 1, order, spans, _no_data(page, number), codec, rows, predictor == 2)
 
 
 def _no_data(page: Any, number: int) -> list[float]:

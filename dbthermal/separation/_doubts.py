@@ -41,19 +41,24 @@ def against_response(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
     noises = responses.noise(response, names) if "noise" in response else np.zeros(len(names))
     patterns = corrected["pattern_std"].values if "pattern_std" in corrected else 0.0
     stds = np.hypot(noises * schema.noise_factor(corrected), patterns)
-    curves = responses.curves(response, names)
-    for name, curve, film, std in zip(names, curves, counts, stds, strict=True):
+    ends = [it.counts([it.lowest, it.highest]) for it in responses.curves(response, names)]
+    fitting = list[str]()  # the band of each, whose range the fewest samples lie outside
+    for place, (name, film, std) in enumerate(zip(names, counts, stds, strict=True)):
         every = film[:: max(1, len(film) // _FRAMES), ::step, ::step].values[:, good]
-        low, high = curve.counts([curve.lowest, curve.highest])
-        margin = RANGE_SIGMAS * std
-        outside = (every < low - margin) | (every > high + margin)
-        share = float(outside.sum() / max(1, np.count_nonzero(~np.isnan(every))))
-        if share > _OUTSIDE:
+        beyond = [RANGE_SIGMAS * std * np.array([-1, 1]) + end for end in ends]
+        number = max(1, np.count_nonzero(~np.isnan(every)))
+        shares = [((every < low) | (every > high)).sum() / number for low, high in beyond]
+        fitting.append(names[int(np.argmin(shares))])
+        if shares[place] > _OUTSIDE:
+            low, high = ends[place]
             sentences.append(
-                f"{share:.0%} of the samples of band '{name}' lie outside the {low:.0f} to "
+                f"{shares[place]:.0%} of the samples of band '{name}' lie outside the {low:.0f} to "
                 f"{high:.0f} count that its response was calibrated over. Must lie within: "
                 "calibrate over the temperatures of the scene; or is it another band's response?"
             )
+    if not any(map(str.__eq__, names, fitting)):
+        rule = "are files of the bands exchanged, of the scene or of the blackbody?"
+        sentences.insert(0, f"Counts of bands {names} fit the response of {fitting} better: {rule}")
     return sentences
 
 

@@ -209,10 +209,8 @@ def _checked_settings(method: Method, settings: Any) -> Any:
         return None if kind is None else kind()
     if kind is None or type(settings) is not kind:
         rule = "be omitted: it has no settings" if kind is None else f"be {kind.__name__}"
-        raise TypeError(
-            f"Invalid settings of type {type(settings).__name__} for method '{method.name}'. "
-            f"Must {rule}."
-        )
+        label = f"Invalid settings of type {type(settings).__name__} for method '{method.name}'"
+        raise TypeError(f"{label}. Must {rule}.")
     return settings
 
 
@@ -329,15 +327,11 @@ def _known_emissivity(
     bad = ~((values > 0) & (values < 1))
     if np.any(bad):
         band, y, x = np.argwhere(bad)[0]
-        raise ValueError(
-            f"Invalid emissivity {values[band, y, x]} in band "
-            f"'{corrected['band'].values[band]}', pixel ({y}, {x}). Must lie in (0, 1)."
-        )
+        place = f"in band '{corrected['band'].values[band]}', pixel ({y}, {x})"
+        raise ValueError(f"Invalid emissivity {values[band, y, x]} {place}. Must lie in (0, 1).")
     if np.all(values == values[0]):
-        raise ValueError(
-            f"Invalid emissivities {values[:, 0, 0]}: the same in both bands. Must differ; "
-            "a gray body cannot be separated."
-        )
+        rule = "the same in both bands. Must differ; a gray body cannot be separated"
+        raise ValueError(f"Invalid emissivities {values[:, 0, 0]}: {rule}.")
     if covariance is not None:
         together = _over_image(corrected, covariance, "emissivity_covariance", "other_band")
         least = np.linalg.eigvalsh(np.moveaxis(together, (0, 1), (-2, -1))).min()  # of one half
@@ -355,10 +349,14 @@ def _known_emissivity(
 
 def _over_image(corrected: xr.Dataset, array: xr.DataArray, name: str, *second: str) -> Array:
     """Values (band, ..., y, x) of an array over the bands, of one pixel or of all."""
-    schema.check_numbers(array, name, "1")
     allowed = ("band", *second), ("band", *second, "y", "x")
+    rule = f"Must be a DataArray of dims {allowed[0]} or {allowed[1]}, such as xr.DataArray("
+    rule += f"{[[0.86, 0.04], [0.04, 0.72]] if second else [0.86, 0.72]}, dims={[*allowed[0]]})"
+    if not isinstance(array, xr.DataArray):
+        raise TypeError(f"Invalid {name} of type {type(array).__name__}. {rule}.")
+    schema.check_numbers(array, name, "1")
     if array.dims not in allowed:
-        raise ValueError(f"Invalid dims {array.dims} of {name}. Must be one of {allowed}.")
+        raise ValueError(f"Invalid dims {array.dims} of {name}. {rule}.")
     array = laid_on(array, corrected, name, "the capture")
     for dim in second:  # the same bands
         exchanged = array.rename({"band": dim, dim: "band"})
@@ -375,10 +373,8 @@ def _displacement(
     if shift is None:
         return None
     if method.whole_image or "background_temperature" in method.not_estimated:
-        raise ValueError(
-            f"Invalid reflection_shift for method '{method.name}', which separates no reflection. "
-            "Omit it."
-        )
+        label = f"Invalid reflection_shift for method '{method.name}'"
+        raise ValueError(f"{label}, which separates no reflection. Omit it.")
     return displaced.check(shift, corrected, reference)
 
 

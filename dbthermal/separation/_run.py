@@ -262,10 +262,8 @@ def _pairs(source: Any, target: Any) -> list[tuple[Path | xr.Dataset, Path]]:
     single = isinstance(target, str | Path)
     sources, targets = ([source], [target]) if single else (list(source), list(target))
     if len(sources) != len(targets):
-        raise ValueError(
-            f"Invalid number of targets {len(targets)} for {len(sources)} captures. Must be one "
-            "for each."
-        )
+        label = f"Invalid number of targets {len(targets)} for {len(sources)} captures"
+        raise ValueError(f"{label}. Must be one for each.")
     places = [texts.as_path(place).absolute() for place in targets]
     captures = [
         it if isinstance(it, xr.Dataset) else texts.as_path(it).absolute() for it in sources
