@@ -38,6 +38,7 @@ TAIL: Final = 3.0
 _PLANES, _SAMPLE = 128, 1024
 _DEGREE: Final = 7
 _LEAST_SHARE: Final = 1e-3  # share of a neighbourhood without which a blurred pixel is none [1]
+_STEP: Final = 0.1  # of the background, by which the slope of a bend is told [K]
 # Deviations of noise across the axis of the ratios from which the bands are apart.
 _APART: Final = 8.0
 
@@ -83,6 +84,7 @@ class Planes:
     noise: Array  # of a band's samples, resampled or not (2, band, y, x) [K]
     freedom: Array  # sum of the functions' squares (y, x)
     usable: Mask  # (y, x)
+    bend: Array  # change of a straight signal with the first band's own (band, pixel) [1]
 
     @np.errstate(invalid="ignore", divide="ignore", over="ignore")
     def combined(self, weights: Array, pixels: Any) -> tuple[Array, Array]:
@@ -115,10 +117,15 @@ class Planes:
             noise = (self.noise[1] * less).reshape(bands, -1)
         flat, freedom = maps.reshape(bands, -1, pixels), self.freedom.ravel()
         scatter = np.empty((bands, bands, pixels))
+        bend = self.bend * noise[0] / noise
         for first in range(bands):
             for second in range(first, bands):
                 total = np.einsum("fp,fp->p", flat[first], flat[second])
-                total = total / (noise[first] * noise[second]) - freedom * (first == second)
+                # The noise of the background, which is the first band's, is in the bend of others.
+                shared = (
+                    (first == second) + bend[first] * bend[second] - (first == 0) * bend[second]
+                )
+                total = total / (noise[first] * noise[second]) - freedom * shared
                 scatter[first, second] = scatter[second, first] = total
         usable = self.usable.ravel()
         scatter[..., ~usable] = 0.0
@@ -133,6 +140,7 @@ def project(inputs: Inputs, result: xr.Dataset, emissivity: Floats, threads: Exe
     straight = np.zeros((len(bands), columns.functions.shape[1], height * width), np.float32)
     noise, freedom = np.ones((2, len(bands), height, width)), np.ones((height, width))
     usable = np.zeros((height, width), dtype=bool)
+    bend = np.zeros((len(bands), height * width))
     noise[1] = (inputs.noise / schema.noise_factor(inputs.capture))[bands, None, None]
     response = _response(tuple(inputs.curves[band] for band in bands))
     film = result["object_temperature"].values.reshape(len(rapid), -1)
@@ -152,7 +160,7 @@ def project(inputs: Inputs, result: xr.Dataset, emissivity: Floats, threads: Exe
                 _emit(np.asarray(x, np.float32), response, emitted)
                 inverse, quick = inverse.astype(np.float32), quick.astype(np.float32)
                 signals = np.ascontiguousarray(tile.signals, np.float32)
-                _straighten(signals, emitted, shares, response)
+                bend[:, places] = _straighten(signals, emitted, shares, response)
                 for band, signal in enumerate(signals):
                     straight[band][:, places] = inverse @ signal
                 if inputs.difference is not None:
@@ -169,7 +177,7 @@ def project(inputs: Inputs, result: xr.Dataset, emissivity: Floats, threads: Exe
         release()
 
     list(threads.map(block, inputs.blocks))
-    return Planes(maps, straight, columns.object_part, columns.steps, noise, freedom, usable)
+    return Planes(maps, straight, columns.object_part, columns.steps, noise, freedom, usable, bend)
 
 
 class Response(NamedTuple):
@@ -202,13 +210,15 @@ def _emit(film: npt.NDArray[np.float32], response: Response, emitted: Any) -> No
 @compiled
 def _straighten(
     signals: Array, emitted: npt.NDArray[np.float32], emissivity: Array, response: Response
-) -> None:
+) -> Array:
     """Take the bend of the background out of signals (band, time, pixel) [K], in place.
 
     The background is what the first band holds beside the signal of an object (time, pixel) [K];
-    where that is not known nothing is taken out.
+    where that is not known nothing is taken out. Returns the mean change of what is taken out with
+    the first band's signal (band, pixel) [1].
     """
     bands, frames, pixels = signals.shape
+    change = np.zeros((bands, pixels))
     low, high = _polynomial_at(response.series, -1.0), _polynomial_at(response.series, 1.0)
     for t in range(frames):
         for p in range(pixels):
@@ -219,7 +229,11 @@ def _straighten(
             background = min(max(background, low), high)
             for band in range(1, bands):
                 bend = _polynomial_at(response.bends[band - 1], background)
+                after = _polynomial_at(response.bends[band - 1], background + _STEP)
                 signals[band, t, p] -= (1.0 - emissivity[band, p]) * bend
+                rate = (after - bend) / (_STEP * frames * (1.0 - share))
+                change[band, p] += (1.0 - emissivity[band, p]) * rate
+    return change
 
 
 @compiled
