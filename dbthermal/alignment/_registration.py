@@ -59,6 +59,9 @@ def register(
     A homography registers a plane exactly. Side-by-side cameras see its reflections at different
     places of the plane: no transform brings object and reflection together.
 
+    TypeError or ValueError if the image is smaller than 16 pixels either way, a mean is not finite,
+    the correlation of two views is below 0.5, or they share less than half the image.
+
     Parameters
     ----------
     corrected : Dataset
@@ -75,12 +78,6 @@ def register(
         (band, row, column) [1], for `align`: for each band H, which takes the homogeneous position
         (x, y, 1) of a pixel of the first view to that of the same point in this one. Pixels count
         from 0 at the centre of the first; the identity in the first band. Attribute: `model`.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the image is smaller than 16 pixels either way, a mean is not finite, the correlation of
-        two views is below 0.5, or they share less than half the image.
 
     References
     ----------

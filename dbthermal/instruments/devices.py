@@ -149,13 +149,9 @@ def open_devices(
     and `pictures` has by band the counts that an emulated camera sees in it, at a time of the scene
     [s]; by default, with the default world, its blackbody. The devices are closed in the end.
 
-    Raises
-    ------
-    ValueError, KeyError
-        If an address or a camera is of another kind, or world or pictures are given for hardware;
-        if the world has no such camera.
-    OSError, WheelError, TC08Error
-        If a device cannot be opened, or is another one.
+    ValueError if an address or a camera is of another kind, or world or pictures are given for
+    hardware, KeyError if the world has no such camera; OSError, WheelError or TC08Error if a device
+    cannot be opened, or is another one.
 
     Examples
     --------

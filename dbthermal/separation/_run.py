@@ -72,12 +72,10 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
         to be computed is for threads or a cluster's workers, not for a ProcessPoolExecutor.
     target : str or Path, or as many
         Folder ``*.zarr`` for each result. While it is made, its parts are in ``*.zarr.parts``.
-    response : Dataset
-        As for `solve`.
     method : str
         One of `METHODS`. For materials and a shift of the reflections, which need the whole image,
         see `scene.separate_capture`.
-    settings, emissivity, emissivity_std, emissivity_covariance, mask, response_kind, seed
+    response, settings, emissivity, emissivity_std, emissivity_covariance, mask, response_kind, seed
         As for `solve`, the same for all captures.
     executor : Executor, optional
         Of `concurrent.futures`, or with its interface, as from ``distributed.Client.get_executor``;

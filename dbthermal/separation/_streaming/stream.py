@@ -44,6 +44,9 @@ class Stream:
     before and one after, or over less where that does not agree; the background is that of every
     frame (eq. 9). The first object compiles, which takes some seconds.
 
+    TypeError or ValueError as from `solve`; if the bands are not two, the response has no noise, or
+    a number is not positive.
+
     Parameters
     ----------
     template : Dataset
@@ -59,15 +62,11 @@ class Stream:
         Shortest time that is remembered; the longest is four times as long [s].
     refresh : float
         Time in which all rows are separated anew [s].
-    settings : SubspaceSettings, optional
-        Options of the method "subspace".
     reflection_shift : Dataset, optional
         From `alignment.reflection_shift`: the second camera's frames are resampled. The object is
         taken to be as warm in both places.
-    response_kind : {"exact", "linear"}
-        As for `solve`.
-    workers : int
-        Number of threads.
+    settings, response_kind, workers
+        As for `solve` by the method "subspace".
 
     Attributes
     ----------
@@ -75,11 +74,6 @@ class Stream:
         Names of the bands, as in the template.
     lost_frames : int
         Frames that did not come, by the times of the others, or were of no use.
-
-    Raises
-    ------
-    TypeError, ValueError
-        As `solve`; if the bands are not two, the response has no noise, a number is not positive.
 
     Notes
     -----
@@ -183,6 +177,9 @@ class Stream:
     ) -> xr.Dataset:
         """Take one frame of both bands, or several, and return the temperatures that became known.
 
+        TypeError or ValueError if the frames are not floating or of another shape, a time does not
+        rise, or the segment falls.
+
         Parameters
         ----------
         time : array_like
@@ -200,12 +197,6 @@ class Stream:
             Stage `separated` of `schema`, of the frames a `latency` ago, with
             `emissivity_covariance`; of no frames while none became known. Emissivities and
             `status` are those of now, and attribute `lost_frames` counts all that were lost.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If the frames are not floating or of another shape, a time does not rise, or the segment
-            falls.
         """
         times, counts = self._checked(time, frames, segment)
         emitted, films, status = [], [], self._history.status
@@ -226,15 +217,7 @@ class Stream:
     def result(self) -> xr.Dataset:
         """Return what the last `update` returned that made any temperatures known.
 
-        Returns
-        -------
-        Dataset
-            As from `update`.
-
-        Raises
-        ------
-        ValueError
-            If none are known yet.
+        ValueError if none are known yet.
         """
         if not self.is_ready:
             least = METHOD.minimum_frames * self._block
