@@ -110,10 +110,8 @@ def register(
         counts = counts.isel(time=longest)
     counts = counts.isel(time=slice(None, None, max(1, counts.sizes["time"] // _READ)))
     if min(counts.sizes["y"], counts.sizes["x"]) < _SMALLEST:
-        raise ValueError(
-            f"Invalid image of {counts.sizes['y']} by {counts.sizes['x']} pixels to be registered. "
-            f"Must be at least {_SMALLEST} either way."
-        )
+        size = f"{counts.sizes['y']} by {counts.sizes['x']} pixels to be registered"
+        raise ValueError(f"Invalid image of {size}. Must be at least {_SMALLEST} either way.")
     bad = corrected["status"].values > 0 if "status" in corrected else np.bool_(False)
     curves = [_curves(view, bad) for view in counts]
     matrices = [np.eye(3)]

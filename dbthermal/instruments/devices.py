@@ -72,10 +72,9 @@ class Devices:
             # Frames and command port must be those of one camera.
             numbers = identity.get("serial_number"), control.get("serial_number")
             if None not in numbers and numbers[0] != numbers[1]:
-                raise ValueError(
-                    f"Invalid cameras {numbers} of band '{band}': frames come from the first, "
-                    "commands go to the second. Must be one camera."
-                )
+                state = "frames come from the first, commands go to the second"
+                rule = "Must be one camera"
+                raise ValueError(f"Invalid cameras {numbers} of band '{band}': {state}. {rule}.")
             identities[band] = {**identity, **control}
         for name, device in ((WHEEL, self.wheel), (LOGGER, self.thermocouples)):
             if device is not None:

@@ -209,10 +209,8 @@ def _checked_settings(method: Method, settings: Any) -> Any:
         return None if kind is None else kind()
     if kind is None or type(settings) is not kind:
         rule = "be omitted: it has no settings" if kind is None else f"be {kind.__name__}"
-        raise TypeError(
-            f"Invalid settings of type {type(settings).__name__} for method '{method.name}'. "
-            f"Must {rule}."
-        )
+        label = f"settings of type {type(settings).__name__} for method '{method.name}'"
+        raise TypeError(f"Invalid {label}. Must {rule}.")
     return settings
 
 
@@ -329,15 +327,12 @@ def _known_emissivity(
     bad = ~((values > 0) & (values < 1))
     if np.any(bad):
         band, y, x = np.argwhere(bad)[0]
-        raise ValueError(
-            f"Invalid emissivity {values[band, y, x]} in band "
-            f"'{corrected['band'].values[band]}', pixel ({y}, {x}). Must lie in (0, 1)."
-        )
+        place = f"band '{corrected['band'].values[band]}', pixel ({y}, {x})"
+        label = f"Invalid emissivity {values[band, y, x]} in {place}"
+        raise ValueError(f"{label}. Must lie in (0, 1).")
     if np.all(values == values[0]):
-        raise ValueError(
-            f"Invalid emissivities {values[:, 0, 0]}: the same in both bands. Must differ; "
-            "a gray body cannot be separated."
-        )
+        rule = "Must differ; a gray body cannot be separated"
+        raise ValueError(f"Invalid emissivities {values[:, 0, 0]}: the same in both bands. {rule}.")
     if covariance is not None:
         together = _over_image(corrected, covariance, "emissivity_covariance", "other_band")
         least = np.linalg.eigvalsh(np.moveaxis(together, (0, 1), (-2, -1))).min()  # of one half
@@ -375,10 +370,8 @@ def _displacement(
     if shift is None:
         return None
     if method.whole_image or "background_temperature" in method.not_estimated:
-        raise ValueError(
-            f"Invalid reflection_shift for method '{method.name}', which separates no reflection. "
-            "Omit it."
-        )
+        label = f"method '{method.name}', which separates no reflection"
+        raise ValueError(f"Invalid reflection_shift for {label}. Omit it.")
     return displaced.check(shift, corrected, reference)
 
 

@@ -260,10 +260,8 @@ def _pairs(source: Any, target: Any) -> list[tuple[Path | xr.Dataset, Path]]:
     single = isinstance(target, str | Path)
     sources, targets = ([source], [target]) if single else (list(source), list(target))
     if len(sources) != len(targets):
-        raise ValueError(
-            f"Invalid number of targets {len(targets)} for {len(sources)} captures. Must be one "
-            "for each."
-        )
+        label = f"Invalid number of targets {len(targets)} for {len(sources)} captures"
+        raise ValueError(f"{label}. Must be one for each.")
     places = [texts.as_path(place).absolute() for place in targets]
     captures = [
         it if isinstance(it, xr.Dataset) else texts.as_path(it).absolute() for it in sources
@@ -328,18 +326,15 @@ def _begin(folder: Path, plan: Mapping[str, Any]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     if not file.exists():
         if foreign := [it.name for it in folder.iterdir() if not it.name.startswith(".plan-")]:
-            raise ValueError(
-                f"Foreign folder '{folder}', with '{foreign[0]}'. Must be of a run, for it is "
-                "deleted at the end, or none."
-            )
+            rule = "Must be of a run, for it is deleted at the end, or none"
+            raise ValueError(f"Foreign folder '{folder}', with '{foreign[0]}'. {rule}.")
         draft = folder / f".plan-{os.getpid()}"
         draft.write_text(content)
         draft.replace(file)
     elif file.read_text() != content:
-        raise ValueError(
-            f"Invalid folder '{folder}': of a run of another capture, response, version, memory or "
-            "options. Must be deleted, or the run be started as it was."
-        )
+        state = "of a run of another capture, response, version, memory or options"
+        rule = "Must be deleted, or the run be started as it was"
+        raise ValueError(f"Invalid folder '{folder}': {state}. {rule}.")
 
 
 def _content(

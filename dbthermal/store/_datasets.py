@@ -20,6 +20,7 @@ import zarr
 from zarr.codecs import BloscCodec, Crc32cCodec
 
 from dbthermal import _text as texts
+from dbthermal import schema
 from dbthermal.store import _integrity as integrity
 from dbthermal.store._results import as_json
 from dbthermal.store._whole import whole
@@ -89,8 +90,7 @@ def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -
     ...     store.open_dataset(f"{folder}/wall.zarr").counts.values.tolist()
     [20310, 20750]
     """
-    if not isinstance(dataset, xr.Dataset):
-        raise TypeError(f"Invalid dataset of type {type(dataset).__name__}. Must be a Dataset.")
+    schema.require(dataset, xr.Dataset, "dataset")
     _save([dataset], path, provenance)
 
 

@@ -282,10 +282,9 @@ def require_filter(path: str | Path, band: str | None) -> None:
     filters = store.open_dataset(path).attrs["provenance"]["parameters"]["filters"]
     slots = {value for _, _, source, value in notes(path) if source == "filter_wheel"}
     if {filters.get(f"{slot:.0f}") for slot in slots} != {band}:
-        raise ValueError(
-            f"Invalid slots {sorted(slots)} of the wheel in the recording '{path}'. "
-            f"Must be that of filter '{band}' throughout: move it away, and record it again."
-        )
+        label = f"Invalid slots {sorted(slots)} of the wheel in the recording '{path}'"
+        rule = f"that of filter '{band}' throughout: move it away, and record it again"
+        raise ValueError(f"{label}. Must be {rule}.")
 
 
 def is_complete(path: str | Path) -> bool:

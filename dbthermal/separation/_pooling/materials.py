@@ -251,10 +251,8 @@ def _checked(
     names = [name for name in schema.STAGES["separated"] if name in _NEEDED or name in result]
     schema.check(result, "separated", names, "the result")
     if "reflection_ratio" in result.attrs.get("not_estimated", "").split():
-        raise ValueError(
-            f"Invalid result of method '{result.attrs.get('method')}', which estimates no "
-            "reflection ratio. Must be of one that does, as 'subspace'."
-        )
+        label = f"method '{result.attrs.get('method')}', which estimates no reflection ratio"
+        raise ValueError(f"Invalid result of {label}. Must be of one that does, as 'subspace'.")
     return laid_on(result, corrected, "the result", "the capture")
 
 

@@ -220,11 +220,9 @@ class Stream:
         ValueError if none are known yet.
         """
         if not self.is_ready:
-            least = METHOD.minimum_frames * self._block
-            raise ValueError(
-                f"Missing frames: {self._blocks * self._block} came, and no temperatures are "
-                f"known. Must be at least {least}."
-            )
+            came, least = self._blocks * self._block, METHOD.minimum_frames * self._block
+            state = f"Missing frames: {came} came, and no temperatures are known"
+            raise ValueError(f"{state}. Must be at least {least}.")
         return self._result
 
     def _checked(self, time: npt.ArrayLike, frames: Any, segment: int) -> tuple[Array, Planes]:
@@ -238,16 +236,13 @@ class Stream:
         times, counts = _numbers.real_numbers("time [s] of frames", time), np.ma.asarray(frames)
         segment = _numbers.whole_number("segment", segment, (-(2**31), 2**31))
         if counts.dtype.kind != "f":
-            raise TypeError(
-                f"Invalid dtype {counts.dtype} of the frames: raw counts. Must be floating: "
-                "corrected by correction.correct."
-            )
+            rule = "Must be floating: corrected by correction.correct"
+            raise TypeError(f"Invalid dtype {counts.dtype} of the frames: raw counts. {rule}.")
         expected = (2, *times.shape, *self._shape)
         if times.ndim > 1 or counts.shape != expected:
-            raise ValueError(
-                f"Invalid shape {counts.shape} of the frames, at times of shape {times.shape}. "
-                f"Must be {expected}: bands, times if they are several, rows and columns."
-            )
+            label = f"Invalid shape {counts.shape} of the frames, at times of shape {times.shape}"
+            rule = f"Must be {expected}: bands, times if they are several, rows and columns"
+            raise ValueError(f"{label}. {rule}.")
         times = times.reshape(-1)
         before = np.concatenate([[self._now], times[:-1]])
         bad = ~((times > before) & np.isfinite(times))
