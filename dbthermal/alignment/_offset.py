@@ -218,9 +218,7 @@ def sample(corrected: xr.Dataset) -> Array:
     counts = subsample["counts"].values.astype(np.float64)
     counts[~schema.measured(counts)] = np.nan
     counts = counts.reshape(*counts.shape[:2], -1)
-    usable = np.ones(counts.shape[2], dtype=bool)
-    if "status" in subsample:
-        usable &= (subsample["status"].values.reshape(-1) & int(schema.UNMEASURED)) == 0
+    usable = (schema.pixel_status(subsample).ravel() & np.uint32(schema.UNMEASURED)) == 0
     for movie in counts:
         absent = clocks.missing(movie)
         movie[absent], recorded = np.nan, movie[~absent]

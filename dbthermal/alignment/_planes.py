@@ -104,9 +104,7 @@ class Capture:
             raise ValueError(f"Invalid image of {size}. {rule}.")
         slopes, noise = scale.slopes, scale.noise_of(corrected)
         order = np.argsort(noise / schema.noise_factor(corrected), kind="stable")
-        valid = np.ones(counts.shape[2:], dtype=bool)
-        if "status" in corrected:
-            valid &= (corrected["status"].values & int(schema.UNMEASURED)) == 0
+        valid = (schema.pixel_status(corrected) & np.uint32(schema.UNMEASURED)) == 0
         frames = _frames(counts)
         times, segment = corrected["time"].values[frames], schema.segments(corrected)[frames]
         steps = np.diff(times)

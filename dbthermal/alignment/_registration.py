@@ -112,7 +112,7 @@ def register(
     if min(counts.sizes["y"], counts.sizes["x"]) < _SMALLEST:
         size = f"{counts.sizes['y']} by {counts.sizes['x']} pixels to be registered"
         raise ValueError(f"Invalid image of {size}. Must be at least {_SMALLEST} either way.")
-    bad = corrected["status"].values > 0 if "status" in corrected else np.bool_(False)
+    bad = schema.pixel_status(corrected) > 0
     curves = [_curves(view, bad) for view in counts]
     matrices = [np.eye(3)]
     for band, curve in zip(counts["band"].values[1:], curves[1:], strict=True):
@@ -126,7 +126,7 @@ def register(
     )
 
 
-def _curves(view: xr.DataArray, bad: Mask | np.bool_) -> Array:
+def _curves(view: xr.DataArray, bad: Mask) -> Array:
     """Smooth curves at a few times (time, y, x), over their mean and standard deviation."""
     frames, label = np.asarray(view.values), f"Invalid view in band '{view['band'].item()}'"
     present = np.flatnonzero(~clocks.missing(frames))

@@ -161,8 +161,8 @@ def _time_constants(time_constant: float | xr.DataArray, counts: xr.DataArray) -
 
 def _good(patches: xr.DataArray, corrected: xr.Dataset, label: str) -> Mask:
     """Pixels (..., y, x) of patches, less those with a status."""
-    good: Mask = laid_on(patches, corrected, label, "the capture").values
-    return good & (corrected["status"].values == 0) if "status" in corrected else good
+    marked = laid_on(patches, corrected, label, "the capture").values
+    return np.asarray(marked & (schema.pixel_status(corrected) == 0))
 
 
 _PATCHES = schema.Variable(("patch", "y", "x"), "bool", "1", "pixels of a patch")

@@ -63,6 +63,11 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
     bytes; a target that the same run has made is left as it is. A capture is recognised by its
     store's checksums; one in memory or lazy by its values.
 
+    TypeError or ValueError as from `solve`; if the memory is too small for a column of a row, or
+    for the chunks of dask's that hold it, or the parts are of another run. BlockingIOError, with
+    its name, while another process separates into the target. ExceptionGroup of the errors of
+    several captures, each with the capture's name; all others are finished.
+
     Parameters
     ----------
     source : str, Path, Dataset, or a sequence of these
@@ -89,16 +94,6 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
         See `store.save`.
     progress : bool
         Show a bar.
-
-    Raises
-    ------
-    TypeError, ValueError
-        As `solve` does; if the memory is too small for a column of a row, or for the chunks of
-        dask's that hold it, or the parts are of another run.
-    BlockingIOError
-        With its name, while another process separates into the target.
-    ExceptionGroup
-        Errors of several captures, each with the capture's name; all others are finished.
 
     Examples
     --------

@@ -132,9 +132,8 @@ class Stream:
         height = shape[0]
         self._rows = [slice(y, min(y + _ROWS, height)) for y in range(0, height, _ROWS)]
         self._camera = kernels.camera(inputs)
-        self._status, self._gain = np.zeros(shape, np.uint32), np.ones(shape, np.float32)
-        if "status" in template:
-            self._status |= template["status"].values.astype(np.uint32)
+        self._status = schema.pixel_status(template).copy()
+        self._gain = np.ones(shape, np.float32)
         self._resample = list[Any]()
         if inputs.displacement is not None:
             self._pair(inputs.displacement)
