@@ -104,7 +104,7 @@ class Inputs:
     @property
     def good(self) -> Mask:
         """Pixels (y, x) of the capture without a flag."""
-        return schema.pixel_status(self.capture) == 0
+        return np.asarray(schema.pixel_status(self.capture) == 0)
 
     @property
     def frames(self) -> Mask:
