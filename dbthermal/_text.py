@@ -178,20 +178,15 @@ def read_yaml(path: str | Path) -> dict[Any, Any]:
 
     Keys are text or numbers; values are mappings, lists, text, finite numbers, bool or None.
 
+    ValueError, one line with file, line, column and rule, for: text that is no YAML, or no mapping;
+    repeated keys (also ``1`` beside ``"1"``); anchors, aliases, tags, several documents, deep
+    nesting; numbers that are not finite; and plain values that the versions of YAML read
+    differently, such as ``on``, ``012``, ``12:30``, ``1e3`` or a date. In quotes they are text.
+
     Parameters
     ----------
     path : str or Path
-        Regular file in UTF-8 of at most `YAML_LIMIT` bytes.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be opened.
-    ValueError
-        One line with file, line, column and rule, for: text that is no YAML, or no mapping;
-        repeated keys (also ``1`` beside ``"1"``); anchors, aliases, tags, several documents, deep
-        nesting; numbers that are not finite; and plain values that the versions of YAML read
-        differently, such as ``on``, ``012``, ``12:30``, ``1e3`` or a date. In quotes they are text.
+        Regular file in UTF-8 of at most `YAML_LIMIT` bytes; OSError if it cannot be opened.
 
     Examples
     --------

@@ -94,10 +94,9 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
         raise ValueError(f"Invalid {label}. Must be (time, pixel), and equal.")
     frames, pixels = first.shape
     if frames < MINIMUM_FRAMES or pixels == 0:
-        raise ValueError(
-            f"Invalid capture of {frames} frames and {pixels} usable pixels to estimate a noise "
-            f"from. Must have at least {MINIMUM_FRAMES} frames and 1 pixel; or give the noise."
-        )
+        label = f"{frames} frames and {pixels} usable pixels to estimate a noise from"
+        rule = f"Must have at least {MINIMUM_FRAMES} frames and 1 pixel; or give the noise"
+        raise ValueError(f"Invalid capture of {label}. {rule}.")
     for signal in (first, second):
         schema.require_measured(signal, "signal")
     # Remove the object: smooth functions, then second differences.
@@ -122,10 +121,9 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
     variances = np.array([auto_first, auto_second]) - shared_variance
     result = [float(np.median(variance)) for variance in variances]
     if not min(result) > 0:
-        raise ValueError(
-            f"Invalid noise variances {result} estimated from the data. Must be positive: "
-            "the signals vary from frame to frame by less than they resolve; give the noise."
-        )
+        rule = "the signals vary from frame to frame by less than they resolve; give the noise"
+        label = f"Invalid noise variances {result} estimated from the data"
+        raise ValueError(f"{label}. Must be positive: {rule}.")
     return float(np.sqrt(result[0])), float(np.sqrt(result[1]))
 
 

@@ -425,11 +425,10 @@ def check_corrected(dataset: xr.Dataset) -> xr.Dataset:
     """Check a dataset of the stage `corrected`; whole numbers are raw counts and a TypeError."""
     counts = check(dataset, "corrected")["counts"]
     if counts.dtype.kind != "f":
-        raise TypeError(
-            f"Invalid dtype {counts.dtype} of 'counts' of the corrected: raw counts. Must be "
-            "floating: corrected by correction.correct_capture, of a camera that corrects itself "
-            "with correction.corrected_by_camera(capture)."
-        )
+        label = f"dtype {counts.dtype} of 'counts' of the corrected: raw counts"
+        rule = "floating: corrected by correction.correct_capture, of a camera that corrects "
+        rule += "itself with correction.corrected_by_camera(capture)"
+        raise TypeError(f"Invalid {label}. Must be {rule}.")
     return dataset
 
 
@@ -512,10 +511,15 @@ def _check_coordinate(array: xr.DataArray, dim: str, label: str) -> None:
         raise ValueError(f"Invalid '{dim}' of {label}: not finite. Must be finite.")
     if np.any(steps <= 0):
         place = int(np.argmax(steps <= 0))
-        raise ValueError(
-            f"Unordered '{dim}' of {label}: {values[place]} {units} is followed by "
-            f"{values[place + 1]} {units}. Must increase strictly."
-        )
+        pair = f"{values[place]} {units} is followed by {values[place + 1]} {units}"
+        raise ValueError(f"Unordered '{dim}' of {label}: {pair}. Must increase strictly.")
+
+
+def pixel_status(capture: xr.Dataset) -> npt.NDArray[np.uint32]:
+    """Bits of `Status` of each pixel (y, x), 0 without a variable `status`."""
+    if "status" not in capture:
+        return np.zeros((capture.sizes["y"], capture.sizes["x"]), dtype=np.uint32)
+    return np.asarray(capture["status"].values, dtype=np.uint32)
 
 
 def segments(capture: xr.Dataset) -> npt.NDArray[np.intp]:

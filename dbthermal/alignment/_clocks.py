@@ -132,23 +132,19 @@ def fill_times(stamps: Array) -> Array:
     slots, step = np.arange(stamps.size), frame_period(stamps)
     recorded = np.flatnonzero(np.isfinite(stamps))
     interpolated = np.interp(slots, recorded, stamps[recorded])
-    early, late = np.minimum(slots - recorded[0], 0), np.maximum(slots - recorded[-1], 0)
-    return np.asarray(interpolated + step * (early + late))
+    outside = slots - np.clip(slots, recorded[0], recorded[-1])
+    return np.asarray(interpolated + step * outside)
 
 
 def _check_stamps(stamps: Array, label: str) -> None:
     if stamps.size < _MINIMUM_FRAMES or not np.all(np.isfinite(stamps)):
-        raise ValueError(
-            f"Invalid exposure times of {label}: {stamps.size} stamps. Must be finite, "
-            f"{_MINIMUM_FRAMES} at least, or NaN where there is no frame."
-        )
+        rule = f"Must be finite, {_MINIMUM_FRAMES} at least, or NaN where there is no frame"
+        raise ValueError(f"Invalid exposure times of {label}: {stamps.size} stamps. {rule}.")
     steps = np.diff(stamps)
     if np.any(steps <= 0):
         place = int(np.argmax(steps <= 0))
-        raise ValueError(
-            f"Unordered exposure times of {label}: {stamps[place]} s is followed by "
-            f"{stamps[place + 1]} s. Must increase strictly."
-        )
+        pair = f"{stamps[place]} s is followed by {stamps[place + 1]} s"
+        raise ValueError(f"Unordered exposure times of {label}: {pair}. Must increase strictly.")
 
 
 def missing(frames: npt.NDArray[Any]) -> Mask:
@@ -177,10 +173,8 @@ def even_times(stamps: Array, reach: int) -> Array:
         return np.asarray(stamps[0])
     start, stop = float(np.nanmin(stamps, axis=1).max()), float(np.nanmax(stamps, axis=1).min())
     if stop - start < step:
-        raise ValueError(
-            f"Invalid exposure times: the bands overlap from {start} to {stop} s. Must overlap by "
-            f"two frames, {step} s apart."
-        )
+        label = f"Invalid exposure times: the bands overlap from {start} to {stop} s"
+        raise ValueError(f"{label}. Must overlap by two frames, {step} s apart.")
     nearest = np.unique(np.rint((stamps[np.isfinite(stamps)] - start) / step))
     slots = np.unique(nearest[:, np.newaxis] + np.arange(-reach, reach + 1.0))
     return np.asarray(start + step * slots[(slots >= 0) & (slots * step < stop - start)])
@@ -223,10 +217,8 @@ def interpolation(
     """
     usable = np.flatnonzero(present & np.isfinite(stamps))
     if usable.size < _MINIMUM_FRAMES:
-        raise ValueError(
-            f"Invalid capture of {usable.size} valid frames. Must be at least {_MINIMUM_FRAMES}: "
-            "the others are NaN or copies of the frame before."
-        )
+        rule = f"at least {_MINIMUM_FRAMES}: the others are NaN or copies of the frame before"
+        raise ValueError(f"Invalid capture of {usable.size} valid frames. Must be {rule}.")
     times, step = stamps[usable], frame_period(np.where(present, stamps, np.nan))
     # Frames before and after each wanted time, and weight of the latter.
     right = np.clip(np.searchsorted(times, wanted), 1, usable.size - 1)

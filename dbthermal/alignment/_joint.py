@@ -266,9 +266,8 @@ def _of_squares(corrected: xr.Dataset) -> xr.Dataset:
         return corrected
     bands, frames, height, width = (*counts.shape[:2], *(n // side for n in counts.shape[2:]))
     film = empty((bands, frames, height, width), np.float32)
-    covered, bad = np.zeros((height, width), bool), np.zeros(counts.shape[2:], bool)
-    if "status" in corrected:
-        bad = (corrected["status"].values & int(schema.UNMEASURED)) != 0
+    covered = np.zeros((height, width), bool)
+    bad = (schema.pixel_status(corrected) & np.uint32(schema.UNMEASURED)) != 0
     for row in range(height):
         window = slice(row * side, (row + 1) * side), slice(0, width * side)
         values = counts[:, :, *window].values

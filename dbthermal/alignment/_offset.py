@@ -181,10 +181,9 @@ def _offset(pair: xr.Dataset, signals: Array, stamps: Array, search: int) -> tup
     # Jackknife over n groups: var = (n - 1) mean (d_i - mean d)^2.
     std = np.sqrt((_GROUPS - 1) * np.var(delays[1:]))
     if not std <= _PRECISION:
-        raise ValueError(
-            f"Invalid time offset {label}: {delays[0]:.2f} +- {std:.2f} frames. Must be known "
-            f"within {_PRECISION}: too little moves, or in too few pixels; give offset= [s]."
-        )
+        rule = f"within {_PRECISION}: too little moves, or in too few pixels; give offset= [s]"
+        found = f"{delays[0]:.2f} +- {std:.2f} frames"
+        raise ValueError(f"Invalid time offset {label}: {found}. Must be known {rule}.")
     period = clocks.frame_period(shared.times)
     return float(delays[0] * period), float(std * period)
 
@@ -197,10 +196,8 @@ def check(corrected: xr.Dataset, band: str | None, search: int) -> int:
         raise ValueError(f"Invalid bands {names} of the capture. Must be at least two.")
     frames = counts.sizes["time"]
     if frames < _MINIMUM_FRAMES:
-        raise ValueError(
-            f"Invalid capture of {frames} frames for a time offset. "
-            f"Must have at least {_MINIMUM_FRAMES}."
-        )
+        rule = f"Must have at least {_MINIMUM_FRAMES}"
+        raise ValueError(f"Invalid capture of {frames} frames for a time offset. {rule}.")
     _numbers.whole_number("search [frame]", search, (1, frames // 4))
     (place,) = schema.band_positions(counts, [names[1] if band is None else band], "the capture")
     if place == 0:
@@ -221,19 +218,15 @@ def sample(corrected: xr.Dataset) -> Array:
     counts = subsample["counts"].values.astype(np.float64)
     counts[~schema.measured(counts)] = np.nan
     counts = counts.reshape(*counts.shape[:2], -1)
-    usable = np.ones(counts.shape[2], dtype=bool)
-    if "status" in subsample:
-        usable &= (subsample["status"].values.reshape(-1) & int(schema.UNMEASURED)) == 0
+    usable = (schema.pixel_status(subsample).ravel() & np.uint32(schema.UNMEASURED)) == 0
     for movie in counts:
         absent = clocks.missing(movie)
         movie[absent], recorded = np.nan, movie[~absent]
         changes = recorded.max(axis=0, initial=-np.inf) > recorded.min(axis=0, initial=np.inf)
         usable &= np.all(np.isfinite(recorded), axis=0) & changes
     if usable.sum() < _GROUPS:
-        raise ValueError(
-            f"Invalid capture of {usable.sum()} usable pixels. Must be at least {_GROUPS} that are "
-            "finite and change."
-        )
+        rule = f"Must be at least {_GROUPS} that are finite and change"
+        raise ValueError(f"Invalid capture of {usable.sum()} usable pixels. {rule}.")
     return counts[:, :, usable]
 
 
@@ -300,10 +293,9 @@ def _common(shared: _Pair, names: list[str]) -> Mask:
             f"share at least {100 * _COMMON:.0f} %, for a time offset; give the offset."
         )
     if common.sum() < _MINIMUM_FRAMES:
-        raise ValueError(
-            f"Invalid capture of {common.sum()} valid frames of both bands '{names[0]}' and "
-            f"'{names[1]}'. Must be at least {_MINIMUM_FRAMES} for a time offset."
-        )
+        label = f"{common.sum()} valid frames of both bands '{names[0]}' and '{names[1]}'"
+        rule = f"Must be at least {_MINIMUM_FRAMES} for a time offset"
+        raise ValueError(f"Invalid capture of {label}. {rule}.")
     return np.asarray(common)
 
 
@@ -340,10 +332,9 @@ def _peak(cross: Array, label: str) -> int:
             "right, search farther by search= [frame], or give offset= [s] beyond the times."
         )
     if abs(lag) == middle - 2:
-        raise ValueError(
-            f"Invalid time offset {label}: the largest covariance is at {lag} "
-            "frames, the end of the search. Must lie inside: search farther by search= [frame]."
-        )
+        found = f"the largest covariance is at {lag} frames, the end of the search"
+        rule = "Must lie inside: search farther by search= [frame]"
+        raise ValueError(f"Invalid time offset {label}: {found}. {rule}.")
     return lag
 
 

@@ -99,15 +99,12 @@ class Capture:
         if len(names) < 2:
             raise ValueError(f"Invalid bands {names} of the corrected. Must be two or more.")
         if min(counts.shape[2:]) < SMALLEST:
-            raise ValueError(
-                f"Invalid image of {counts.shape[2]} rows and {counts.shape[3]} columns. Must have "
-                f"at least {SMALLEST} of each to match reflections."
-            )
+            size = f"{counts.shape[2]} rows and {counts.shape[3]} columns"
+            rule = f"Must have at least {SMALLEST} of each to match reflections"
+            raise ValueError(f"Invalid image of {size}. {rule}.")
         slopes, noise = scale.slopes, scale.noise_of(corrected)
         order = np.argsort(noise / schema.noise_factor(corrected), kind="stable")
-        valid = np.ones(counts.shape[2:], dtype=bool)
-        if "status" in corrected:
-            valid &= (corrected["status"].values & int(schema.UNMEASURED)) == 0
+        valid = (schema.pixel_status(corrected) & np.uint32(schema.UNMEASURED)) == 0
         frames = _frames(counts)
         times, segment = corrected["time"].values[frames], schema.segments(corrected)[frames]
         steps = np.diff(times)
@@ -222,10 +219,8 @@ def _frames(counts: xr.DataArray) -> npt.NDArray[np.intp]:
     share = valid[..., ever].mean(axis=2).min(axis=0) if ever.any() else np.zeros(valid.shape[1])
     used = np.flatnonzero(share > _COMMON)
     if used.size < noises.MINIMUM_FRAMES:
-        raise ValueError(
-            f"Invalid capture of {used.size} frames that all bands have. Must be at least "
-            f"{noises.MINIMUM_FRAMES}."
-        )
+        rule = f"Must be at least {noises.MINIMUM_FRAMES}"
+        raise ValueError(f"Invalid capture of {used.size} frames that all bands have. {rule}.")
     return used
 
 

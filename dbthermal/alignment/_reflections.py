@@ -52,6 +52,9 @@ def reflection_shift(corrected: xr.Dataset, response: xr.Dataset) -> xr.Dataset:
     It is needed where `separation.solve` flags `bands_apart` and there is no offset in time; where
     the cameras see from one place the shift is zero within its deviation.
 
+    TypeError or ValueError if an input is not as described, the image is too small, nothing that
+    both bands see changes rapidly, or the shift is beyond a third of the image.
+
     Parameters
     ----------
     corrected : Dataset
@@ -69,12 +72,6 @@ def reflection_shift(corrected: xr.Dataset, response: xr.Dataset) -> xr.Dataset:
         extrapolated near by, and NaN farther off and where p + d(p) leaves the image. Attributes:
         `reference_band`, `bands` (the others); `delay` [s] of these, beside the shift, and
         `delay_std` [s].
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an input is not as described, the image is too small, nothing that both bands see changes
-        rapidly, or the shift is beyond a third of the image.
     """
     names = [str(name) for name in schema.check_corrected(corrected)["counts"]["band"].values]
     return shift_of(corrected, Scale.of_response(response, names)).drop_vars("energy")

@@ -59,6 +59,9 @@ def register(
     A homography registers a plane exactly. Side-by-side cameras see its reflections at different
     places of the plane: no transform brings object and reflection together.
 
+    TypeError or ValueError if the image is smaller than 16 pixels either way, a mean is not finite,
+    the correlation of two views is below 0.5, or they share less than half the image.
+
     Parameters
     ----------
     corrected : Dataset
@@ -75,12 +78,6 @@ def register(
         (band, row, column) [1], for `align`: for each band H, which takes the homogeneous position
         (x, y, 1) of a pixel of the first view to that of the same point in this one. Pixels count
         from 0 at the centre of the first; the identity in the first band. Attribute: `model`.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the image is smaller than 16 pixels either way, a mean is not finite, the correlation of
-        two views is below 0.5, or they share less than half the image.
 
     References
     ----------
@@ -113,11 +110,9 @@ def register(
         counts = counts.isel(time=longest)
     counts = counts.isel(time=slice(None, None, max(1, counts.sizes["time"] // _READ)))
     if min(counts.sizes["y"], counts.sizes["x"]) < _SMALLEST:
-        raise ValueError(
-            f"Invalid image of {counts.sizes['y']} by {counts.sizes['x']} pixels to be registered. "
-            f"Must be at least {_SMALLEST} either way."
-        )
-    bad = corrected["status"].values > 0 if "status" in corrected else np.bool_(False)
+        size = f"{counts.sizes['y']} by {counts.sizes['x']} pixels to be registered"
+        raise ValueError(f"Invalid image of {size}. Must be at least {_SMALLEST} either way.")
+    bad = schema.pixel_status(corrected) > 0
     curves = [_curves(view, bad) for view in counts]
     matrices = [np.eye(3)]
     for band, curve in zip(counts["band"].values[1:], curves[1:], strict=True):
@@ -131,7 +126,7 @@ def register(
     )
 
 
-def _curves(view: xr.DataArray, bad: Mask | np.bool_) -> Array:
+def _curves(view: xr.DataArray, bad: Mask) -> Array:
     """Smooth curves at a few times (time, y, x), over their mean and standard deviation."""
     frames, label = np.asarray(view.values), f"Invalid view in band '{view['band'].item()}'"
     present = np.flatnonzero(~clocks.missing(frames))

@@ -101,10 +101,8 @@ def _offsets(
             raise ValueError(f"Invalid offset {offset} s for bands {names}. {rule}.")
         values = np.array([0.0, _numbers.real_number("offset [s]", offset)])
     if values[0] != 0 or not np.all(np.isfinite(values)):
-        raise ValueError(
-            f"Invalid offset {values.tolist()} s. Must be finite, and 0 in band '{names[0]}', the "
-            "first."
-        )
+        rule = f"Must be finite, and 0 in band '{names[0]}', the first"
+        raise ValueError(f"Invalid offset {values.tolist()} s. {rule}.")
     return values
 
 

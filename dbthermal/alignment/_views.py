@@ -132,10 +132,8 @@ def _maps(transform: xr.DataArray, corrected: xr.Dataset) -> list[Array]:
     values = transform.values[schema.band_positions(transform, names, "the transform")]
     if expected is MAP:
         if values.shape[1:] != (2, *shape):
-            raise ValueError(
-                f"Invalid transform of shape {values.shape[1:]}. Must be {(2, *shape)} in each "
-                "band, as the image."
-            )
+            rule = f"Must be {(2, *shape)} in each band, as the image"
+            raise ValueError(f"Invalid transform of shape {values.shape[1:]}. {rule}.")
         return [*values.astype(np.float64)]
     if values.shape[1:] != (3, 3) or not np.all(np.isfinite(values)):
         rule = "Must be 3x3 and finite in each band"

@@ -73,6 +73,8 @@ def correct_capture(  # noqa: PLR0913 - the options of each step, by name
     5. `mark_bad`: pixels that are noisy, stuck or jump, in units of this capture's noise.
     6. `undo_drift` last, so that no bad pixel is part of the reference patch.
 
+    TypeError or ValueError if capture or correction is not of its stage, and as the steps.
+
     Parameters
     ----------
     capture : Dataset
@@ -108,11 +110,6 @@ def correct_capture(  # noqa: PLR0913 - the options of each step, by name
         offsets), ``frames_taken_out`` (by band, by `mark_shutter`), ``bad_frames`` (by band, which
         show no scene), and ``shutter_closed_frames`` (by band, recorded as closed; -1 without
         `frame_flags`).
-
-    Raises
-    ------
-    TypeError, ValueError
-        If capture or correction is not of its stage, and as the steps.
 
     Warns
     -----

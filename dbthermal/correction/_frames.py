@@ -113,9 +113,7 @@ def unreported(corrected: xr.Dataset, valid: Mask, renewals: Mask) -> Findings:
     Of 4e5 good frames of 48 kinds of scenes at 2 to 50 Hz less than 2e-4 are taken for bad ones.
     """
     counts = corrected["counts"]
-    good = np.ones(counts.shape[2:], dtype=bool)
-    if "status" in corrected:
-        good &= (corrected["status"].values & int(schema.Status.DEAD_PIXEL)) == 0
+    good = (schema.pixel_status(corrected) & np.uint32(schema.Status.DEAD_PIXEL)) == 0
     # Films without the pixels that are no measurement.
     films = []
     for movie, frames in zip(counts, valid, strict=True):

@@ -222,6 +222,9 @@ def correct(
 ) -> xr.Dataset:
     """Apply gain and offset to a capture, and mark its bad and saturated pixels.
 
+    TypeError or ValueError if the capture is not uint16 or was corrected before, `maximum` is out
+    of range, or the correction lacks a band, is not finite, or is of other pixels.
+
     Parameters
     ----------
     capture : Dataset
@@ -238,12 +241,6 @@ def correct(
         (band) [count] where the correction has its deviations, root mean square over the levels of
         the capture. Attributes: ``gain_offset_corrected`` = 1, or 0 where the camera does it, the
         parameters of the fit (``gain_offset_...``), and the numbers of marked pixels.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the capture is not uint16 or was corrected before, `maximum` is out of range, or the
-        correction lacks a band, is not finite, or is of other pixels.
     """
     counts = schema.check(capture, "capture")["counts"]
     if capture.attrs.get("gain_offset_corrected"):

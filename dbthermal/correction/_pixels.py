@@ -137,8 +137,7 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
             logarithm = np.log(level / usual)  # minus infinity where nothing changes
         noisy |= outlying(logarithm, np.isfinite(logarithm), threshold) | (level == 0)
         jumping |= _jumps(movie, threshold * np.sqrt(2.0) * usual, stepped, reach)
-    before = corrected["status"].values if "status" in corrected else np.zeros(image, np.uint32)
-    status = before | (noisy | jumping) * np.uint32(Status.DEAD_PIXEL)
+    status = schema.pixel_status(corrected) | (noisy | jumping) * np.uint32(Status.DEAD_PIXEL)
     result = corrected.assign(
         status=(("y", "x"), status, schema.status_attrs()),
         pattern_std=("band", stds, schema.PATTERN_STD.attrs),

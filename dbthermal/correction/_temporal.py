@@ -116,7 +116,10 @@ def undo_drift(
     if "drift" in corrected:
         raise ValueError("Invalid dataset: the drift was undone before. Must be as it drifts.")
     order = _numbers.whole_number("order of the drift", order, (2, counts.sizes["time"]))
-    rows, columns = np.nonzero(_patch(corrected, reference))
+    schema.check_variable(reference, _PATCH, "the reference")
+    rows, columns = np.nonzero(_good(reference, corrected, "the reference"))
+    if not rows.size:
+        raise ValueError("Invalid reference: it marks no good pixel. Must mark at least one.")
     patch = counts.isel(y=xr.DataArray(rows, dims="p"), x=xr.DataArray(columns, dims="p"))
     level = patch.mean("p", dtype=np.float64, skipna=False)
     torn = np.isnan(level.values) & patch.notnull().any("p").values
@@ -156,15 +159,10 @@ def _time_constants(time_constant: float | xr.DataArray, counts: xr.DataArray) -
     return values
 
 
-def _patch(corrected: xr.Dataset, reference: xr.DataArray) -> Mask:
-    """Good pixels (y, x) of the reference patch."""
-    schema.check_variable(reference, _PATCH, "the reference")
-    good = laid_on(reference, corrected, "the reference", "the capture").values.copy()
-    if "status" in corrected:
-        good &= corrected["status"].values == 0
-    if not good.any():
-        raise ValueError("Invalid reference: it marks no good pixel. Must mark at least one.")
-    return good
+def _good(patches: xr.DataArray, corrected: xr.Dataset, label: str) -> Mask:
+    """Pixels (..., y, x) of patches, less those with a status."""
+    marked = laid_on(patches, corrected, label, "the capture").values
+    return np.asarray(marked & (schema.pixel_status(corrected) == 0))
 
 
 _PATCHES = schema.Variable(("patch", "y", "x"), "bool", "1", "pixels of a patch")
@@ -206,9 +204,7 @@ def refer(corrected: xr.Dataset, reference: Reference, *, lazy: bool) -> xr.Data
     Attribute ``level_reference`` has what remains unknown, see `response.accuracy`.
     """
     counts, names = corrected["counts"], [str(name) for name in corrected["band"].values]
-    masks = laid_on(reference.patches, corrected, "the patches", "the capture").values.copy()
-    if "status" in corrected:
-        masks &= corrected["status"].values == 0
+    masks = _good(reference.patches, corrected, "the patches")
     if np.any(few := masks.sum(axis=(1, 2)) < 2):
         raise ValueError(f"Invalid patch {int(np.argmax(few))}. Must have two good pixels or more.")
     # Mean of the patches over time, and how it scatters over their pixels.

@@ -243,10 +243,8 @@ class Boson(Closing):
             self.set(setting, value)
             state = self.get(setting)
             if state != value:
-                raise ValueError(
-                    f"Invalid {setting.name} {state!r} of camera {self.serial_number()}, set to "
-                    f"{value!r}. Must be as it was set."
-                )
+                label = f"Invalid {setting.name} {state!r} of camera {self.serial_number()}"
+                raise ValueError(f"{label}, set to {value!r}. Must be as it was set.")
 
     def run_ffc(self, *, timeout: float = FFC_TIMEOUT) -> int:
         """Run a flat-field correction, wait until it is complete, return its frame number.

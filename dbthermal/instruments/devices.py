@@ -72,10 +72,9 @@ class Devices:
             # Frames and command port must be those of one camera.
             numbers = identity.get("serial_number"), control.get("serial_number")
             if None not in numbers and numbers[0] != numbers[1]:
-                raise ValueError(
-                    f"Invalid cameras {numbers} of band '{band}': frames come from the first, "
-                    "commands go to the second. Must be one camera."
-                )
+                state = "frames come from the first, commands go to the second"
+                rule = "Must be one camera"
+                raise ValueError(f"Invalid cameras {numbers} of band '{band}': {state}. {rule}.")
             identities[band] = {**identity, **control}
         for name, device in ((WHEEL, self.wheel), (LOGGER, self.thermocouples)):
             if device is not None:
@@ -149,13 +148,9 @@ def open_devices(
     and `pictures` has by band the counts that an emulated camera sees in it, at a time of the scene
     [s]; by default, with the default world, its blackbody. The devices are closed in the end.
 
-    Raises
-    ------
-    ValueError, KeyError
-        If an address or a camera is of another kind, or world or pictures are given for hardware;
-        if the world has no such camera.
-    OSError, WheelError, TC08Error
-        If a device cannot be opened, or is another one.
+    ValueError if an address or a camera is of another kind, or world or pictures are given for
+    hardware, KeyError if the world has no such camera; OSError, WheelError or TC08Error if a device
+    cannot be opened, or is another one.
 
     Examples
     --------

@@ -334,10 +334,8 @@ class FilterWheel(Closing):
             self._controller.check()
             if faults := status.bits & FAULTS:
                 self.stop()
-                raise StalledWheelError(
-                    f"The controller reports {StatusBits(faults).name}, and the wheel was stopped. "
-                    "Must be none."
-                )
+                label = f"The controller reports {StatusBits(faults).name}"
+                raise StalledWheelError(f"{label}, and the wheel was stopped. Must be none.")
             # The course of the motion so far.
             now, moving = self._clock(), bool(status.bits & MOVING)
             moved |= moving or count not in {None, status.position}
@@ -361,8 +359,6 @@ class FilterWheel(Closing):
                 raise WheelError(f"{label}. Must arrive in this time.")
             elif now - changed > limits[1]:
                 self.stop()
-                raise StalledWheelError(
-                    f"{name}: the wheel stood {place} for {limits[1]} s while it should "
-                    "move, and was stopped. Must turn freely."
-                )
+                label = f"{name}: the wheel stood {place} for {limits[1]} s while it should move"
+                raise StalledWheelError(f"{label}, and was stopped. Must turn freely.")
             self._clock.sleep(POLL_INTERVAL)

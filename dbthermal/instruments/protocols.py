@@ -100,6 +100,11 @@ def record_sweep(
     goes on where it was. If the folder is renamed or moved meanwhile the sweep goes on in it. Call
     `Devices.prepare` before.
 
+    ValueError if the session has no blackbody, or no reading of it; or a recording exists that is
+    incomplete, of another temperature, or during which the wheel turned. TimeoutError as
+    `wait_stable`; SourceLostError or FileNotFoundError if a camera is lost, or the folder deleted.
+    What was recorded is kept.
+
     Parameters
     ----------
     devices : Devices
@@ -115,14 +120,6 @@ def record_sweep(
     -------
     list of Summary
         In the order of the session, by temperature, then filter, with those that were kept.
-
-    Raises
-    ------
-    ValueError
-        If the session has no blackbody, or no reading of it; or a recording exists that is
-        incomplete, of another temperature, or during which the wheel turned.
-    TimeoutError, SourceLostError, FileNotFoundError
-        As `wait_stable`; or a camera is lost, or the folder deleted. What was recorded is kept.
     """
     session = devices.session
     readings = devices.readings()

@@ -171,10 +171,9 @@ class TC08(Closing):
         deadline = self.clock() + timeout
         while not (progress := self._library.usb_tc08_open_unit_progress(handle, percent)):
             if self.clock() >= deadline:
-                raise TimeoutError(
-                    f"The TC-08 is not open after {timeout} s, at {percent[0]} %. Must have its "
-                    "firmware by then: pull it out and plug it in again."
-                )
+                state = f"The TC-08 is not open after {timeout} s, at {percent[0]} %"
+                rule = "Must have its firmware by then: pull it out and plug it in again"
+                raise TimeoutError(f"{state}. {rule}.")
             self.clock.sleep(POLL)
         # What became of it.
         if progress < 0:
@@ -242,10 +241,9 @@ class TC08(Closing):
             self._used.add(channel)
         if np.isnan(temperature := float(scan.temperature[channel])):
             reason = "overflow" if scan.overflow[channel] else "open"
-            raise ReadingError(
-                f"No temperature of thermocouple '{self.channels[channel]}' in channel {channel}: "
-                f"{reason}. Must be connected, and within its range."
-            )
+            label = f"thermocouple '{self.channels[channel]}' in channel {channel}: {reason}"
+            rule = "Must be connected, and within its range"
+            raise ReadingError(f"No temperature of {label}. {rule}.")
         return temperature
 
     def single(self) -> Scan:

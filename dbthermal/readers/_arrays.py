@@ -35,6 +35,12 @@ def array(
     Pickled objects are never loaded, and nothing is taken from another file. Damage of HDF5 and
     zarr without checksums is not seen. An array that another library has opened may be lazy.
 
+    The Dataset is as from `tiff`, and so are the errors for unit, clock, memory and 8 bits.
+    FileNotFoundError if there is no file, ImportError without the extra ``recordings`` for HDF5 and
+    NetCDF 4; TypeError or ValueError if a file is of another format, or damaged; the array is not
+    one of three dimensions and uint16, has other dims, is scaled, lacks values, has times that the
+    clock contradicts, or is not in the file.
+
     Parameters
     ----------
     source : str, Path, array or DataArray
@@ -46,20 +52,6 @@ def array(
     unit, clock, memory
         As for `tiff`; an array's own ``units``, and its times to half a frame, must agree. Without
         a clock its times are taken; those without a unit are seconds if the rate is 1 to 1000 Hz.
-
-    Returns
-    -------
-    Dataset
-        As from `tiff`.
-
-    Raises
-    ------
-    FileNotFoundError, ImportError
-        If there is no file, or the extra ``recordings`` is not installed for HDF5 and NetCDF 4.
-    TypeError, ValueError
-        If a file is of another format, or damaged; the array is not one of three dimensions and
-        uint16, has other dims, is scaled, lacks values, has times that the clock contradicts, or is
-        not in the file; as `tiff` for unit, clock, memory and 8 bits.
 
     Examples
     --------

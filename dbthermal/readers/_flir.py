@@ -87,6 +87,12 @@ def flir(
     the header. A record with a checksum (JPEG) must fit it. FLIR's sequences have none: a damaged
     pixel or, in JPEG-LS, one flipped bit in ten changes counts without complaint.
 
+    OSError if a file cannot be opened, ImportError without the extra ``recordings`` for compressed
+    ones; TypeError or ValueError if a file is no FLIR recording, damaged or truncated, or takes too
+    much memory; frames differ in size or in the maker's constants; the byte order is unclear or
+    contradicts the image; the counts have 8 bits; the times are unknown or fall; or memory is no
+    number.
+
     Parameters
     ----------
     path : str, Path or sequence
@@ -108,15 +114,6 @@ def flir(
         Attributes: ``start`` (UTC), ``source``, ``format``, ``byte_order``, ``byte_order_by``,
         ``implausible`` (values that no thermographer means), and the camera's record as
         ``file_...``, temperatures in K, distance in m, rate in Hz.
-
-    Raises
-    ------
-    OSError, ImportError
-        If a file cannot be opened, or the extra ``recordings`` is not installed for compressed ones.
-    TypeError, ValueError
-        If a file is no FLIR recording, damaged or truncated, or takes too much memory; frames
-        differ in size or in the maker's constants; the byte order is unclear or contradicts the
-        image; the counts have 8 bits; the times are unknown or fall; or memory is no number.
 
     Examples
     --------

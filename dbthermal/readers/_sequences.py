@@ -112,22 +112,15 @@ def _are_longer(counts: Counts) -> bool:
 def sequence(path: str | Path, *, clock: Clock | None = None, memory: float = MEMORY) -> xr.Dataset:
     """Counts of a recording in an .sfmov of FLIR or an .hcc of Telops.
 
+    Result and errors are as from `array`; ValueError, too, if the numbers are temperatures or
+    radiances.
+
     Parameters
     ----------
     path : str or Path
         File; the .inc of an .sfmov lies beside it.
     clock, memory
         As for `array`.
-
-    Returns
-    -------
-    Dataset
-        As from `tiff`.
-
-    Raises
-    ------
-    FileNotFoundError, ValueError
-        As `array`, and if the numbers are temperatures or radiances.
     """
     _recording.check_number(memory, "memory")
     (path,) = _formats.files([path], "sequence")

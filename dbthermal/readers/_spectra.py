@@ -38,6 +38,10 @@ def ecostress(path: str | Path) -> xr.Dataset:
     law its emissivity is 1 - R / 100. Header and values are compared: units, kind of measurement,
     number of values, first and last wavelength.
 
+    OSError or ValueError if it cannot be opened, is not as long as declared, is no hemispherical
+    reflectance [%] over micrometres, has an emissivity outside `schema.EMISSIVITY_LIMITS`, or a
+    wavelength outside 0.001 to 1000 um or out of order.
+
     Parameters
     ----------
     path : str or Path
@@ -48,13 +52,6 @@ def ecostress(path: str | Path) -> xr.Dataset:
     Dataset
         `emissivity` (wavelength) [1] over wavelength [m]; attributes: what the library says of the
         sample (``name``, ``class``, ...), ``source`` and ``unphysical_values``.
-
-    Raises
-    ------
-    OSError, ValueError
-        If it cannot be opened, is not as long as declared, is no hemispherical reflectance [%] over
-        micrometres, has an emissivity outside `schema.EMISSIVITY_LIMITS`, or a wavelength outside
-        0.001 to 1000 um or out of order.
 
     References
     ----------

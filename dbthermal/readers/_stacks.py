@@ -69,6 +69,12 @@ def tiff(
     These do not tell the unit, and rarely times. An interval of frames, or times, in a description
     of ImageJ or OME must agree with the clock, or serves as one; "origin: simulated" is kept.
 
+    OSError if a file cannot be opened, ImportError without the extra ``recordings``; TypeError or
+    ValueError if the unit is another one; a file is no TIFF, damaged, has fewer pages than it
+    states, two bands in one, or other axes; a page is compressed with loss, in tiles, in colours,
+    not of 16 bits, of another size, a preview, mirrored, rotated, scaled (GDAL), or white where it
+    is 0; counts are missing, take too much memory or have 8 bits; or the clock is wrong.
+
     Parameters
     ----------
     path : str, Path or sequence
@@ -87,16 +93,6 @@ def tiff(
     Dataset
         `counts` (time, y, x) [count], uint16, `exposure_time` and `frame_flags` (time), as from
         `flir`; attributes ``source``, ``format``, ``byte_order``.
-
-    Raises
-    ------
-    OSError, ImportError
-        If a file cannot be opened, or the extra ``recordings`` is not installed.
-    TypeError, ValueError
-        If the unit is another one; a file is no TIFF, damaged, has fewer pages than it states, two
-        bands in one, or other axes; a page is compressed with loss, in tiles, in colours, not of 16
-        bits, of another size, a preview, mirrored, rotated, scaled (GDAL), or white where it is 0;
-        counts are missing, take too much memory or have 8 bits; or the clock is wrong.
 
     Warns
     -----

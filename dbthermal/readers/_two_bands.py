@@ -34,6 +34,11 @@ def two_bands(
     Each band keeps its own frames and times; nothing is interpolated. `alignment.time_offset` and
     `alignment.align` bring all onto one clock: cameras' dates are hardly ever right to a frame.
 
+    TypeError or ValueError if a recording is not one of counts in one band, or its times are
+    unknown, infinite or fall; bands are not different names, one for each; sizes differ; an offset
+    is no number, or there is none and no date; recordings do not overlap in time, or hold the same
+    counts.
+
     Parameters
     ----------
     first, second, *further : Dataset
@@ -51,13 +56,6 @@ def two_bands(
         (band, time). Shorter bands are filled with their last frame, flagged ``padded``, without a
         time; `time` is the clock of the longest one. ``files`` has all recordings' attributes as a
         mapping by band. Copies the counts: twice their memory is needed.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If a recording is not one of counts in one band, or its times are unknown, infinite or fall;
-        bands are not different names, one for each; sizes differ; an offset is no number, or there
-        is none and no date; recordings do not overlap in time, or hold the same counts.
 
     Warns
     -----

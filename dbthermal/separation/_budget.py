@@ -68,17 +68,14 @@ def added(result: xr.Dataset, inputs: Inputs) -> xr.Dataset:
 def without_calibration(result: xr.Dataset, *, drift: bool = True) -> xr.Dataset:
     """Result whose deviations hold noise, ratio and drift alone, not what its calibration states.
 
+    The values are the same; the variables of `schema.BUDGETS` are left out.
+
     Parameters
     ----------
     result : Dataset
         From `solve`, `separate` or `complete`; it is not changed.
     drift : bool
         Keep the part by a background that may have drifted along with the object.
-
-    Returns
-    -------
-    Dataset
-        The same values, without the variables of `schema.BUDGETS`.
     """
     alone = result.drop_vars(["cause", *BUDGETS.values()], errors="ignore")
     causes, by_drift = [*CALIBRATION], np.zeros(1) if drift else _drift(result)

@@ -35,8 +35,8 @@ def against_response(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
     if counts.dtype.kind != "f":  # raw counts of pixels that differ
         return []
     step = stride(counts.shape[2:], _PIXELS)
-    status = corrected["status"].values if "status" in corrected else np.zeros(counts.shape[2:])
-    good = (status.astype(np.uint32) & np.uint32(Status.DEAD_PIXEL))[::step, ::step] == 0
+    status = schema.pixel_status(corrected)[::step, ::step]
+    good = (status & np.uint32(Status.DEAD_PIXEL)) == 0
     names = [str(name) for name in counts["band"].values]
     noises = responses.noise(response, names) if "noise" in response else np.zeros(len(names))
     patterns = corrected["pattern_std"].values if "pattern_std" in corrected else 0.0

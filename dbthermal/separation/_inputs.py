@@ -104,9 +104,7 @@ class Inputs:
     @property
     def good(self) -> Mask:
         """Pixels (y, x) of the capture without a flag."""
-        if "status" in self.capture:
-            return np.asarray(self.capture["status"].values == 0)
-        return np.ones((self.capture.sizes["y"], self.capture.sizes["x"]), dtype=bool)
+        return np.asarray(schema.pixel_status(self.capture) == 0)
 
     @property
     def frames(self) -> Mask:

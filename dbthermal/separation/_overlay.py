@@ -162,7 +162,6 @@ class Laid(Moved):
         """Shift of the reflections between the images as laid, of that between them before."""
         if field is None:
             return None
-        schema.require(field, xr.Dataset, "reflection_shift")
         schema.check(field, "reflection_shift")
         others = self.motion[self.capture["band"].values != self.reference, 0]
         places = places_of(field["known"].shape)

@@ -63,6 +63,11 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
     bytes; a target that the same run has made is left as it is. A capture is recognised by its
     store's checksums; one in memory or lazy by its values.
 
+    TypeError or ValueError as from `solve`; if the memory is too small for a column of a row, or
+    for the chunks of dask's that hold it, or the parts are of another run. BlockingIOError, with
+    its name, while another process separates into the target. ExceptionGroup of the errors of
+    several captures, each with the capture's name; all others are finished.
+
     Parameters
     ----------
     source : str, Path, Dataset, or a sequence of these
@@ -72,12 +77,10 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
         to be computed is for threads or a cluster's workers, not for a ProcessPoolExecutor.
     target : str or Path, or as many
         Folder ``*.zarr`` for each result. While it is made, its parts are in ``*.zarr.parts``.
-    response : Dataset
-        As for `solve`.
     method : str
         One of `METHODS`. For materials and a shift of the reflections, which need the whole image,
         see `scene.separate_capture`.
-    settings, emissivity, emissivity_std, emissivity_covariance, mask, response_kind, seed
+    response, settings, emissivity, emissivity_std, emissivity_covariance, mask, response_kind, seed
         As for `solve`, the same for all captures.
     executor : Executor, optional
         Of `concurrent.futures`, or with its interface, as from ``distributed.Client.get_executor``;
@@ -91,16 +94,6 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
         See `store.save`.
     progress : bool
         Show a bar.
-
-    Raises
-    ------
-    TypeError, ValueError
-        As `solve` does; if the memory is too small for a column of a row, or for the chunks of
-        dask's that hold it, or the parts are of another run.
-    BlockingIOError
-        With its name, while another process separates into the target.
-    ExceptionGroup
-        Errors of several captures, each with the capture's name; all others are finished.
 
     Examples
     --------
@@ -328,18 +321,15 @@ def _begin(folder: Path, plan: Mapping[str, Any]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     if not file.exists():
         if foreign := [it.name for it in folder.iterdir() if not it.name.startswith(".plan-")]:
-            raise ValueError(
-                f"Foreign folder '{folder}', with '{foreign[0]}'. Must be of a run, for it is "
-                "deleted at the end, or none."
-            )
+            rule = "Must be of a run, for it is deleted at the end, or none"
+            raise ValueError(f"Foreign folder '{folder}', with '{foreign[0]}'. {rule}.")
         draft = folder / f".plan-{os.getpid()}"
         draft.write_text(content)
         draft.replace(file)
     elif file.read_text() != content:
-        raise ValueError(
-            f"Invalid folder '{folder}': of a run of another capture, response, version, memory or "
-            "options. Must be deleted, or the run be started as it was."
-        )
+        state = "of a run of another capture, response, version, memory or options"
+        rule = "Must be deleted, or the run be started as it was"
+        raise ValueError(f"Invalid folder '{folder}': {state}. {rule}.")
 
 
 def _content(

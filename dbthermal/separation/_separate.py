@@ -109,11 +109,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
         As from `complete`, and `material` (y, x). Attribute `reflection_shift` says whether one was
         "given", "found" or "none"; `warnings`, and a UserWarning, that bands are apart and no shift
         explains it, or that the counts lie outside the response, as those of another band.
-
-    Raises
-    ------
-    TypeError, ValueError
-        As `solve` and `complete`.
+        TypeError or ValueError as from `solve` and `complete`.
 
     Examples
     --------

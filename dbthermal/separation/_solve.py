@@ -181,20 +181,11 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     """
     require_workers(workers)
     require_seed(seed)
-    inputs = check(
-        corrected,
-        response,
-        get_method(method),
-        settings=settings,
-        seed=seed,
-        emissivity=emissivity,
-        emissivity_std=emissivity_std,
-        emissivity_covariance=emissivity_covariance,
-        mask=mask,
-        pool=pool,
-        reflection_shift=reflection_shift,
-        response_kind=response_kind,
-    )
+    options: dict[str, Any] = {"settings": settings, "mask": mask, "pool": pool, "seed": seed}
+    options |= {"emissivity": emissivity, "emissivity_std": emissivity_std}
+    options |= {"emissivity_covariance": emissivity_covariance, "response_kind": response_kind}
+    options["reflection_shift"] = reflection_shift
+    inputs = check(corrected, response, get_method(method), **options)
     return budget.added(separated(inputs, workers=workers, progress=progress)[0], inputs)
 
 
@@ -300,20 +291,12 @@ def require_seed(seed: Any) -> None:
 def get_method(name: str | Method) -> Method:
     """Record of a method: its functions, its settings, and its demands on the capture.
 
+    Among its fields are `settings`, the type of its options or None, and `knows_emissivity`.
+
     Parameters
     ----------
     name : str or Method
-        One of `METHODS`; a record of your code is returned as it is.
-
-    Returns
-    -------
-    Method
-        Among its fields `settings`, the type of its options or None, and `knows_emissivity`.
-
-    Raises
-    ------
-    ValueError
-        If there is no such method.
+        One of `METHODS`, else ValueError; a record of your code is returned as it is.
 
     Examples
     --------

@@ -20,6 +20,7 @@ import zarr
 from zarr.codecs import BloscCodec, Crc32cCodec
 
 from dbthermal import _text as texts
+from dbthermal import schema
 from dbthermal.store import _integrity as integrity
 from dbthermal.store._results import as_json
 from dbthermal.store._whole import whole
@@ -89,8 +90,7 @@ def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -
     ...     store.open_dataset(f"{folder}/wall.zarr").counts.values.tolist()
     [20310, 20750]
     """
-    if not isinstance(dataset, xr.Dataset):
-        raise TypeError(f"Invalid dataset of type {type(dataset).__name__}. Must be a Dataset.")
+    schema.require(dataset, xr.Dataset, "dataset")
     _save([dataset], path, provenance)
 
 
@@ -238,24 +238,19 @@ def open_dataset(path: str | Path) -> xr.Dataset:
     A recording that was cut short, or is being written, opens as far as all bands are valid; its
     attributes have ``complete`` = False and, in ``frames_written``, the end of each band.
 
+    ValueError, with file, array and store, if a file of it, or of the valid part of a recording
+    that was cut short, is not as it was written, missing, or foreign; of a chunk, when it is read.
+
     Parameters
     ----------
     path : str or Path
-        Folder ``*.zarr``.
+        Folder ``*.zarr``; FileNotFoundError if it does not exist.
 
     Returns
     -------
     Dataset
         Identical to the one saved, with ``attrs["provenance"]`` added. Text is of NumPy's
         fixed-length kind.
-
-    Raises
-    ------
-    FileNotFoundError
-        If the folder does not exist.
-    ValueError
-        With file, array and store, if a file of it, or of the valid part of a recording that was
-        cut short, is not as it was written, missing, or foreign; of a chunk, when it is read.
 
     Warns
     -----

@@ -31,6 +31,7 @@ Values = npt.NDArray[Any]
 
 _LOG_CHUNK: Final = 4096  # rows of a chunk of the log
 _LOOKS: Final = 10  # for a folder, which may be moved while its path is read and compared
+_STAY: Final = "Must stay while it is written to"
 # A chunk of zeros is written too: a missing one was never recorded.
 _FORM: Final[Any] = {
     "compressors": (BloscCodec(cname="lz4", clevel=1, shuffle="bitshuffle"), Crc32cCodec()),
@@ -104,10 +105,9 @@ class Recording:
         for name, held in self._inside.items():
             folder = self.root / name
             if not (folder.exists() and os.path.samestat(folder.stat(), held)):
-                raise FileNotFoundError(
-                    f"No array '{name}' in the recording '{place}' any more: its folder was moved, "
-                    "replaced or deleted. Must stay while it is written to."
-                )
+                state = "any more: its folder was moved, replaced or deleted"
+                label = f"No array '{name}' in the recording '{place}' {state}"
+                raise FileNotFoundError(f"{label}. {_STAY}.")
         return place
 
     @contextmanager
@@ -199,10 +199,9 @@ class Recording:
             # Nothing was lost, and one state of every file counts from here on.
             listed = integrity.last_sums(self.root).keys()
             if lost := sorted(listed - integrity.files_of(self.root)):
-                raise FileNotFoundError(
-                    f"No file '{lost[0]}' in the recording '{self.place()}' any more, of "
-                    f"{len(lost)} that were deleted. Must stay while it is written to."
-                )
+                state = f"any more, of {len(lost)} that were deleted"
+                label = f"No file '{lost[0]}' in the recording '{self.place()}' {state}"
+                raise FileNotFoundError(f"{label}. {_STAY}.")
             self.commit(complete=complete, closed=True, **integrity.MARK, **attrs)
             replace(self.root / integrity.SUMS, integrity.sums_file(integrity.last_sums(self.root)))
             self.path, self._closed = self.place(), True
@@ -250,10 +249,8 @@ class HeldFolder:
                 with suppress(OSError):
                     if os.path.samestat(os.fstat(self._descriptor), path.stat()):
                         return path
-        raise FileNotFoundError(
-            f"No folder '{self._path}' any more: it was deleted, replaced or taken to another "
-            "disk. Must stay while it is written to."
-        )
+        state = "any more: it was deleted, replaced or taken to another disk"
+        raise FileNotFoundError(f"No folder '{self._path}' {state}. {_STAY}.")
 
 
 class DurableStore(integrity.SummedStore):

@@ -42,9 +42,10 @@ def provenance(
     ----------
     parameters : mapping
         Name to value, as in the notebook's parameters cell: finite numbers, strings, booleans,
-        None, and lists and mappings of these.
+        None, and lists and mappings of these; TypeError or ValueError with its name for another.
     inputs : mapping, optional
-        Name to path of each file, or folder such as a zarr store, that was read, for its checksum.
+        Name to path of each file, or folder such as a zarr store, that was read, for its checksum;
+        FileNotFoundError if it does not exist.
 
     Returns
     -------
@@ -52,13 +53,6 @@ def provenance(
         ``parameters``; ``versions`` of Python, dbthermal and its core dependencies; ``commit``, 40
         hexadecimal digits, with ``-dirty`` if tracked files differ from it, or ``"unknown"``
         outside a git work tree; and ``inputs``, name to sha256.
-
-    Raises
-    ------
-    TypeError, ValueError
-        For a parameter of another kind, which the error names.
-    FileNotFoundError
-        If a path of `inputs` does not exist.
 
     Examples
     --------

@@ -54,6 +54,9 @@ _WHOLE: Final = 0.95  # share of the promised frames with which a recording is w
 def open_capture(path: str | Path, *, fitted: bool = False) -> xr.Dataset:
     """Open a recording as stage `capture`, also one that was cut short or is being written.
 
+    FileNotFoundError or ValueError if the folder does not exist, a band has fewer than two frames
+    with a time, or as `dbthermal.store.open_dataset`.
+
     Parameters
     ----------
     path : str or Path
@@ -71,12 +74,6 @@ def open_capture(path: str | Path, *, fitted: bool = False) -> xr.Dataset:
         ``shutter_closed``; `device_time`, `host_time`, `sequence`, and the camera's telemetry, if
         any. `time` is when the first band was exposed [s]. If fitted, attribute ``clock_rates`` has
         b of each band.
-
-    Raises
-    ------
-    FileNotFoundError, ValueError
-        If the folder does not exist, a band has fewer than two frames with a time, or as
-        `dbthermal.store.open_dataset`.
 
     Examples
     --------
@@ -199,6 +196,10 @@ def require_whole(folder: str | Path, *, share: float = _WHOLE) -> None:
 def open_sweep(folder: str | Path, name: str, *, frames: int) -> xr.Dataset:
     """Join the recordings of a blackbody sweep into one dataset.
 
+    FileNotFoundError or ValueError if there is no recording of such a session, or one is missing or
+    incomplete, has fewer good frames in a band, or no reading of the blackbody, or those of a step
+    differ by more than the session's stability.
+
     Parameters
     ----------
     folder, name, frames : str or Path, str, int
@@ -212,13 +213,6 @@ def open_sweep(folder: str | Path, name: str, *, frames: int) -> xr.Dataset:
         with the band of the camera without filters from the recordings through the first filter.
         `temperature` is the mean of the blackbody's readings during the recordings of a step [K].
         Attributes as `calibration.fit_response` takes them, where the session states its accuracy.
-
-    Raises
-    ------
-    FileNotFoundError, ValueError
-        If there is no recording of such a session, or one is missing or incomplete, has fewer good
-        frames in a band, or no reading of the blackbody, or those of a step differ by more than the
-        session's stability.
     """
     steps, stability, shared = _sweep(folder, name)
     movies = [(_agreed(paths, BLACKBODY, stability), _movie(paths, frames)) for paths in steps]
@@ -288,10 +282,9 @@ def require_filter(path: str | Path, band: str | None) -> None:
     filters = store.open_dataset(path).attrs["provenance"]["parameters"]["filters"]
     slots = {value for _, _, source, value in notes(path) if source == "filter_wheel"}
     if {filters.get(f"{slot:.0f}") for slot in slots} != {band}:
-        raise ValueError(
-            f"Invalid slots {sorted(slots)} of the wheel in the recording '{path}'. "
-            f"Must be that of filter '{band}' throughout: move it away, and record it again."
-        )
+        label = f"Invalid slots {sorted(slots)} of the wheel in the recording '{path}'"
+        rule = f"that of filter '{band}' throughout: move it away, and record it again"
+        raise ValueError(f"{label}. Must be {rule}.")
 
 
 def is_complete(path: str | Path) -> bool:

@@ -87,7 +87,6 @@ class Displacement:
 def check(field: xr.Dataset, corrected: xr.Dataset, reference: int) -> Displacement:
     """Check a field of the reflections' shift, see `solve`, against the capture, and invert it."""
     label = "the reflection shift"
-    schema.require(field, xr.Dataset, "reflection_shift")
     schema.check(field, "reflection_shift")
     names = [str(name) for name in corrected["band"].values]
     _check_bands(field, names, names[reference])
@@ -105,10 +104,8 @@ def check(field: xr.Dataset, corrected: xr.Dataset, reference: int) -> Displacem
         raise ValueError(f"Invalid shift_std of {label}. Must be zero or positive, and finite.")
     largest = np.abs(shift[:, finite]).max(axis=1)
     if np.any(largest >= size):
-        raise ValueError(
-            f"Invalid {label[4:]} of {largest.max():g} pixel. Must be less than the image, "
-            f"{size[0]} rows and {size[1]} columns."
-        )
+        rule = f"Must be less than the image, {size[0]} rows and {size[1]} columns"
+        raise ValueError(f"Invalid {label[4:]} of {largest.max():g} pixel. {rule}.")
     # Beyond where it is known the nearest shift leads on; p is where d(p) itself is known.
     nearest = distance_transform_edt(~finite, return_distances=False, return_indices=True)
     shift = shift[:, nearest[0], nearest[1]]

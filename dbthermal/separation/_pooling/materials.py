@@ -78,6 +78,9 @@ def materials(
 ) -> xr.DataArray:
     r"""Label the pixels by material, for `solve(..., pool=labels)`.
 
+    ImportError without scikit-image (extra "materials"), ValueError if a rate is not in (0, 1), a
+    variable is missing, or bands, sizes or coordinates differ.
+
     Parameters
     ----------
     result : Dataset
@@ -102,13 +105,6 @@ def materials(
         borders may be of the neighbour; -1 for that, for pixels without a signal, for regions in
         which no pixel has a ratio and that no neighbour takes in, and for those of less than 16
         pixels.
-
-    Raises
-    ------
-    ImportError
-        If scikit-image is not installed (extra "materials").
-    ValueError
-        If a rate is not in (0, 1), a variable is missing, or bands, sizes or coordinates differ.
 
     Notes
     -----
@@ -255,10 +251,8 @@ def _checked(
     names = [name for name in schema.STAGES["separated"] if name in _NEEDED or name in result]
     schema.check(result, "separated", names, "the result")
     if "reflection_ratio" in result.attrs.get("not_estimated", "").split():
-        raise ValueError(
-            f"Invalid result of method '{result.attrs.get('method')}', which estimates no "
-            "reflection ratio. Must be of one that does, as 'subspace'."
-        )
+        label = f"method '{result.attrs.get('method')}', which estimates no reflection ratio"
+        raise ValueError(f"Invalid result of {label}. Must be of one that does, as 'subspace'.")
     return laid_on(result, corrected, "the result", "the capture")
 
 

@@ -44,6 +44,9 @@ class Stream:
     before and one after, or over less where that does not agree; the background is that of every
     frame (eq. 9). The first object compiles, which takes some seconds.
 
+    TypeError or ValueError as from `solve`; if the bands are not two, the response has no noise, or
+    a number is not positive.
+
     Parameters
     ----------
     template : Dataset
@@ -59,15 +62,11 @@ class Stream:
         Shortest time that is remembered; the longest is four times as long [s].
     refresh : float
         Time in which all rows are separated anew [s].
-    settings : SubspaceSettings, optional
-        Options of the method "subspace".
     reflection_shift : Dataset, optional
         From `alignment.reflection_shift`: the second camera's frames are resampled. The object is
         taken to be as warm in both places.
-    response_kind : {"exact", "linear"}
-        As for `solve`.
-    workers : int
-        Number of threads.
+    settings, response_kind, workers
+        As for `solve` by the method "subspace".
 
     Attributes
     ----------
@@ -75,11 +74,6 @@ class Stream:
         Names of the bands, as in the template.
     lost_frames : int
         Frames that did not come, by the times of the others, or were of no use.
-
-    Raises
-    ------
-    TypeError, ValueError
-        As `solve`; if the bands are not two, the response has no noise, a number is not positive.
 
     Notes
     -----
@@ -138,9 +132,8 @@ class Stream:
         height = shape[0]
         self._rows = [slice(y, min(y + _ROWS, height)) for y in range(0, height, _ROWS)]
         self._camera = kernels.camera(inputs)
-        self._status, self._gain = np.zeros(shape, np.uint32), np.ones(shape, np.float32)
-        if "status" in template:
-            self._status |= template["status"].values.astype(np.uint32)
+        self._status = schema.pixel_status(template).copy()
+        self._gain = np.ones(shape, np.float32)
         self._resample = list[Any]()
         if inputs.displacement is not None:
             self._pair(inputs.displacement)
@@ -183,6 +176,9 @@ class Stream:
     ) -> xr.Dataset:
         """Take one frame of both bands, or several, and return the temperatures that became known.
 
+        TypeError or ValueError if the frames are not floating or of another shape, a time does not
+        rise, or the segment falls.
+
         Parameters
         ----------
         time : array_like
@@ -200,12 +196,6 @@ class Stream:
             Stage `separated` of `schema`, of the frames a `latency` ago, with
             `emissivity_covariance`; of no frames while none became known. Emissivities and
             `status` are those of now, and attribute `lost_frames` counts all that were lost.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If the frames are not floating or of another shape, a time does not rise, or the segment
-            falls.
         """
         times, counts = self._checked(time, frames, segment)
         emitted, films, status = [], [], self._history.status
@@ -226,22 +216,12 @@ class Stream:
     def result(self) -> xr.Dataset:
         """Return what the last `update` returned that made any temperatures known.
 
-        Returns
-        -------
-        Dataset
-            As from `update`.
-
-        Raises
-        ------
-        ValueError
-            If none are known yet.
+        ValueError if none are known yet.
         """
         if not self.is_ready:
-            least = METHOD.minimum_frames * self._block
-            raise ValueError(
-                f"Missing frames: {self._blocks * self._block} came, and no temperatures are "
-                f"known. Must be at least {least}."
-            )
+            came, least = self._blocks * self._block, METHOD.minimum_frames * self._block
+            state = f"Missing frames: {came} came, and no temperatures are known"
+            raise ValueError(f"{state}. Must be at least {least}.")
         return self._result
 
     def _checked(self, time: npt.ArrayLike, frames: Any, segment: int) -> tuple[Array, Planes]:
@@ -255,16 +235,13 @@ class Stream:
         times, counts = _numbers.real_numbers("time [s] of frames", time), np.ma.asarray(frames)
         segment = _numbers.whole_number("segment", segment, (-(2**31), 2**31))
         if counts.dtype.kind != "f":
-            raise TypeError(
-                f"Invalid dtype {counts.dtype} of the frames: raw counts. Must be floating: "
-                "corrected by correction.correct."
-            )
+            rule = "Must be floating: corrected by correction.correct"
+            raise TypeError(f"Invalid dtype {counts.dtype} of the frames: raw counts. {rule}.")
         expected = (2, *times.shape, *self._shape)
         if times.ndim > 1 or counts.shape != expected:
-            raise ValueError(
-                f"Invalid shape {counts.shape} of the frames, at times of shape {times.shape}. "
-                f"Must be {expected}: bands, times if they are several, rows and columns."
-            )
+            label = f"Invalid shape {counts.shape} of the frames, at times of shape {times.shape}"
+            rule = f"Must be {expected}: bands, times if they are several, rows and columns"
+            raise ValueError(f"{label}. {rule}.")
         times = times.reshape(-1)
         before = np.concatenate([[self._now], times[:-1]])
         bad = ~((times > before) & np.isfinite(times))
