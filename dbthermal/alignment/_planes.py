@@ -281,6 +281,7 @@ def _window_equations(corrected: xr.Dataset, scale: Scale) -> list[Array]:
     def films(rows: slice, columns: slice) -> Movie:
         """Films (band, time, y, x) [K] of some rows and columns."""
         film = counts[:, :, rows, columns].values[bands].astype(np.float32)
+        film[:, :, (np.ptp(film, axis=1) == 0.0).any(axis=0)] = np.nan  # of dead pixels
         film[:, ~schema.measured(film).all(axis=0)] = np.nan  # of both the same samples
         flat = film.reshape(2, time.size, -1)
         (first, share), (second, _) = (bridged(block) for block in flat)

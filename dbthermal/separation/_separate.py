@@ -196,7 +196,8 @@ def _mended(
         if steady is None or retry is None:
             break
         undone = _measured(retry[0]) >= _KEPT * _measured(measured)
-        sentences = [steady.sentence(undone=undone)]
+        if undone or retry[1].size < misfit.size:  # else what changes is no motion
+            sentences = [steady.sentence(undone=undone)]
         if not undone:
             break
         capture, motion = steady.capture, steady.motion
@@ -249,9 +250,7 @@ def _separated(
         inputs = replace(inputs, displacement=shift)
     # Separate each pixel.
     alone, surveys = separated(inputs, workers=workers, progress=progress)
-    doubts = [_UNEXPLAINED.format(share)] if share > 0.0 else []
-    if reflection_shift is not None:
-        doubts = _unexplained(alone)
+    doubts = [_UNEXPLAINED.format(share)] if share > 0.0 else _unexplained(alone)
     # Pool the pixels of each material, and hold them to what each tells by itself.
     result = alone
     pool = partial(separated, alone=alone, surveys=surveys, workers=workers, progress=progress)
@@ -310,9 +309,10 @@ def _shift(corrected: xr.Dataset, response: xr.Dataset) -> tuple[xr.Dataset | No
 
 
 def _unexplained(per_pixel: xr.Dataset) -> list[str]:
-    """Doubt about a shift of the reflections with which bands are apart in many pixels."""
+    """Doubt about a shift of the reflections, or none, if bands are apart in many pixels."""
     status = per_pixel["status"].values
-    moving = (status & np.uint32(schema.UNMEASURED | Status.NO_BACKGROUND_MOTION)) == 0
+    other = schema.UNMEASURED | Status.NO_BACKGROUND_MOTION | Status.OBJECT_JUMP
+    moving = (status & np.uint32(other)) == 0
     asynchronous = ((status & np.uint32(Status.BANDS_APART)) != 0) & moving
     share = asynchronous.sum() / max(moving.sum(), 1)
     return [_UNEXPLAINED.format(share)] if share > _MANY else []
