@@ -169,13 +169,12 @@ def filled(
     sample = scene.sample()
     if not scene.apart:  # else the result's reflections are those of two places
         scenes.require_same_capture(scene, result, sample)
-    scene = replace(scene, rapid=scenes.find_rapid(scene, result, sample))
     if context.surroundings is None:
         level = scenes.find_level(scene, sample)
     else:
         level = scenes.stated(scene, context.surroundings, context.surroundings_std)
-        fluctuation = scenes.find_level(replace(scene, level=level), sample).fluctuation
-        level = replace(level, fluctuation=fluctuation)
+        seen = scenes.find_level(replace(scene, level=level), sample)
+        level = replace(seen, signal=level.signal, std=level.std)
     scene = replace(scene, level=level)
     del sample  # before the blocks take memory
     lacking = empty(result[FILMS[0]].shape, np.bool_)  # samples of a result without a film

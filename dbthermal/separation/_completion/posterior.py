@@ -42,16 +42,15 @@ _BOUNDS: Final = (0.01, 0.999)  # of the emissivities about which the model is l
 _VAGUE: Final = 1e6  # where nothing bounds the fluctuation of the background: its variance [K^2]
 
 
-Pair = tuple[Array, float]
-
-
 @dataclass(frozen=True)
 class Level:
-    """Prior on the background: its level, and how much it fluctuates over time."""
+    """Prior on the background: its level, and how much it changes over time."""
 
     signal: Array | float  # first band's signal, less the reference (pixel) [K]
     std: Array | float  # (pixel) [K]
     fluctuation: float  # standard deviation over time [K]
+    rapid: float = np.inf  # that of its rapid changes [K]
+    scatter: float = np.inf  # of the logarithm of these between pixels [1]
 
     def at(self, places: Whole) -> "Level":
         """Return the level of some pixels, each of its own."""
@@ -59,7 +58,7 @@ class Level:
         signal, std = (
             array[places] if array.ndim else np.full(places.size, array) for array in arrays
         )
-        return Level(signal, std, self.fluctuation)
+        return replace(self, signal=signal, std=std)
 
 
 @dataclass(frozen=True)
@@ -84,13 +83,13 @@ class Moments(Pixels):
         return ratio, np.einsum("imp,mnp,jnp->ijp", change, self.emissivity_covariance, change)
 
 
-def moments(tile: Tile, data: Curve, prior: Mixture, level: Level, rapid: Pair) -> Moments:
+def moments(tile: Tile, data: Curve, prior: Mixture, level: Level, rapid: Array) -> Moments:
     """Posterior of the emissivities and of the background's level, steps 1 and 2.
 
-    Of the `rapid` changes see `_of_rapid`.
+    The `rapid` changes (pixel) [K] bound what the pixel mirrors, see `_of_rapid`.
     """
     grid = prior.grid()  # (grid, pixel)
-    mirrored = _of_rapid(grid, *rapid) if prior.weight.size > 1 else np.zeros_like(grid)
+    mirrored = _of_rapid(grid, rapid, level) if prior.weight.size > 1 else np.zeros_like(grid)
     (points, pixels), size = grid.shape, len(tile.noise) + 1
     levels = np.stack([np.broadcast_to(array, pixels) for array in (level.signal, level.std)])
     arrays = (grid, prior.mean, prior.covariance, levels, mirrored, *vars(data).values())
@@ -118,15 +117,15 @@ def moments(tile: Tile, data: Curve, prior: Mixture, level: Level, rapid: Pair) 
     return Moments(point, mean[-1], spread, plain[:-1], covariance[:-1, :-1])
 
 
-def _of_rapid(grid: Array, rapid: Array, scatter: float) -> Array:
-    """Log-likelihood (grid, pixel) of the rapid changes of a pixel, a share of the background's.
+def _of_rapid(grid: Array, rapid: Array, level: Level) -> Array:
+    """Log-likelihood (grid, pixel) of the rapid changes of a pixel beside the background's.
 
     A surface mirrors 1 - e_1 of them, and it may face calmer ones. That they are livelier is as
     probable as their logarithms scatter; or it is the object that changes rapidly.
     """
     with np.errstate(divide="ignore"):
-        excess = np.nan_to_num(np.maximum(np.log(rapid / (1.0 - grid)), 0.0)) / scatter
-    return np.maximum(-0.5 * excess**2, math.log(_OTHERWISE))
+        excess = np.nan_to_num(np.maximum(np.log(rapid / level.rapid / (1.0 - grid)), 0.0))
+    return np.maximum(-0.5 * (excess / level.scatter) ** 2, math.log(_OTHERWISE))
 
 
 def _crossing(grid: Array, falling: Array, level: float) -> Array:

@@ -65,8 +65,7 @@ class Scene:
     offset: Array  # deviation of a pixel's offset against the others, of the other bands [K]
     level: Level
     apart: bool  # the cameras do not see the same reflection in a pixel
-    # Standard deviation of rapid changes of the background [K], and scatter of its logarithm [1].
-    rapid: tuple[float, float] = (np.inf, np.inf)
+    measured: Mask  # pixels without a flag (pixel)
 
     def mixture(self, source: int, places: Whole) -> Mixture:
         """Prior on the emissivities of pixels of one source."""
@@ -133,6 +132,7 @@ def gather(inputs: Inputs, result: xr.Dataset, pooled: xr.Dataset, prior: Any) -
         offset=np.hypot(pattern[1:], pattern[0]),
         level=Level(float(curve.signal(_ROOM[0])) - curve.reference, _ROOM[1], _FLUCTUATION),
         apart=inputs.displacement is not None,
+        measured=result["status"].values.ravel() == 0,
     )
 
 
@@ -163,20 +163,6 @@ def require_same_capture(scene: Scene, result: xr.Dataset, sample: Sample) -> No
             f"Invalid result: its values are {np.median(score):.0f} times the noise off the "
             "signals of the capture. Must be of the same capture."
         )
-
-
-def find_rapid(scene: Scene, result: xr.Dataset, sample: Sample) -> tuple[float, float]:
-    """Rapid changes of the background (`Scene.rapid`), infinite if no pixel tells them.
-
-    The fewer pixels tell them, the less do they say of what the others face.
-    """
-    tile, valid, places = sample
-    std = curves.bins(tile, valid).rapid(tile.noise[0]) / (1.0 - scene.emissivity[0, places])
-    measured = (result["status"].values.ravel()[places] == 0) & (scene.source[places] == OWN)
-    measured &= np.isfinite(std)
-    if not measured.any():
-        return np.inf, np.inf
-    return float(np.median(std[measured])), _SCATTER / float(np.sqrt(measured.mean()))
 
 
 def stated(scene: Scene, surroundings: float | xr.DataArray, std: float) -> Level:
@@ -211,8 +197,7 @@ def solve_statics(
         bend = np.sqrt(np.tensordot(prior.weight, (1.0 - prior.mean[:, 1:] / factor) ** 2, 1))
         bend = bend * level.fluctuation
         data = curves.curve(tile, means, scene.offset, stray**2, bend)
-        rapid = means.rapid(tile.noise[0]) / scene.rapid[0], scene.rapid[1]
-        static = posterior.moments(tile, data, prior, level, rapid)
+        static = posterior.moments(tile, data, prior, level, means.rapid(tile.noise[0]))
         variance = posterior.fluctuation(tile, static, means, level.fluctuation)
     return static, np.maximum(variance, _LEAST[1] ** 2)
 
@@ -277,6 +262,14 @@ def find_level(scene: Scene, sample: Sample) -> Level:
         static, fluctuation = solve_statics(scene, *part)
         before = np.square(scene.level.at(places[of_source]).std)
         estimates.append([static.level, static.covariance[-1, -1], before, fluctuation])
+        if source != OWN:
+            continue
+        # What measured pixels mirror of rapid changes: the fewer, the less it says of others.
+        std = curves.bins(*part[:2]).rapid(tile.noise[0]) / (1.0 - scene.emissivity[0, part[-1]])
+        if (std := std[scene.measured[part[-1]] & np.isfinite(std)]).size:
+            scatter = _SCATTER / np.sqrt(scene.measured.mean())
+            level = replace(scene.level, rapid=float(np.median(std)), scatter=float(scatter))
+            scene = replace(scene, level=level)
     if not estimates:
         return scene.level
     mean, after, before, fluctuation = np.concatenate(estimates, axis=1)
