@@ -8,6 +8,7 @@ import pytest
 import xarray as xr
 from captures import emissivity_of
 from scenes import field, held
+from worlds import World, seen
 
 from dbthermal import emissivity as emissivity_module
 from dbthermal import schema, separation, simulation
@@ -182,6 +183,21 @@ def test_bands_of_no_library_are_not_completed() -> None:
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("gray", [0.3, 0.7, 0.9])
+def test_rapid_changes_bound_what_a_gray_surface_mirrors(gray: float) -> None:
+    """Beside measured glass, which says how lively the background is, intervals of it hold."""
+    capture, truth = seen(World(surface=((0.86, 0.72), (gray, gray))), 1)
+    result = separation.separate(capture, RESPONSE)
+    error = np.abs(result["object_temperature"].values - truth)
+    completed = (result["status"].values & np.uint32(Status.COMPLETED_FROM_PRIOR)) != 0
+    held = (error < 1.96 * result["object_temperature_std"].values)[:, completed].mean()
+    first = float(np.median(result["emissivity"].values[0, completed]))
+    print(f"{completed.sum()} pixels of {gray}: {held:.3f} hold, completed as {first:.3f}")
+    assert completed.sum() > 1000
+    assert held > 0.9
+    assert abs(first - gray) < 0.25
+
+
 def test_unknown_materials_hold() -> None:
     """Nobody walks before materials of the libraries: one prior completes all pixels of each."""
     mixture, rng = emissivity_module.library_mixture(list(RIG.bands)), np.random.default_rng(31)

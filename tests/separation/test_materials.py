@@ -8,6 +8,7 @@ import pytest
 import xarray as xr
 from scenes import PAIR, Scene, Shelf, mosaic, observed
 from scipy import ndimage
+from worlds import RESPONSE, World, seen
 
 from dbthermal import separation, simulation
 from dbthermal.separation import materials
@@ -127,6 +128,20 @@ def test_silence_is_no_agreement(small: Inputs) -> None:
         labels = materials(left, capture, response).values
         assert np.all(labels[:, 44:] == NONE)  # farther from the border than a cell is wide
         assert np.all(labels == NONE) == bool(silent.all())
+
+
+def test_ratio_of_a_material_hangs_on_no_reference() -> None:
+    """The temperature about which responses are linearised changes it by less than its error."""
+    capture, _ = seen(World(), 2)
+    results = []
+    for kelvin in (263.0, 318.0):
+        about = {"reference_temperature": xr.full_like(RESPONSE["reference_temperature"], kelvin)}
+        results.append(separation.separate(capture, RESPONSE.assign(about)))
+    ratios = [result["reflection_ratio"].values for result in results]
+    std = results[0]["reflection_ratio_std"].values
+    off = np.abs(ratios[1] - ratios[0])[1] / std[1]
+    print(f"{np.nanquantile(off, (0.5, 0.9))} deviations apart")
+    assert np.nanquantile(off, 0.9) < 1.0
 
 
 def test_bad_input_is_a_clear_error(small: Inputs) -> None:

@@ -5,6 +5,7 @@ import pytest
 import xarray as xr
 from captures import emissivity_of
 from scenes import Scene, heard, observed
+from worlds import RESPONSE, World, seen
 
 from dbthermal import calibration, schema, separation, simulation
 
@@ -76,6 +77,22 @@ def test_a_step_of_one_camera_is_told(glass_plate: Scene, band: int, kelvin: flo
     partly["counts"] += late * xr.DataArray(slopes, dims="band") * moved
     kept = (partly["band"] != RIG.bands[1 - band]) | (partly["time"] < 5.0) | (moved < 4.0)
     assert steps(partly.assign(counts=partly["counts"].where(kept))) == []
+
+
+def test_bands_apart_are_told_without_a_shift() -> None:
+    """A band that is blurred in time shows no quick reflection as the other does."""
+    capture, _ = seen(World(pace=(20.0, 40.0)), 1)
+    film = capture["counts"].values
+    film[1, 1:-1] = 0.5 * (film[1, :-2] + film[1, 2:])
+    assert any(one.startswith("The bands of") for one in said(capture, RESPONSE))
+
+
+def test_dead_rows_do_not_set_the_bands_apart() -> None:
+    """Two rows that one camera does not see, and nobody marked, are theirs alone."""
+    capture, _ = seen(World(), 1)
+    film = capture["counts"].values
+    film[0, :, 20:22] = film[0, 0, 20:22]
+    assert said(capture, RESPONSE) == []
 
 
 def test_exchanged_blackbody_is_told_by_the_netd() -> None:
