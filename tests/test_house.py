@@ -12,7 +12,7 @@ HOUSE = Path(dbthermal.__file__).parent
 BUDGET = {
     "": (3485, 18),
     "_cli": (1226, 5),
-    "alignment": (2882, 13),
+    "alignment": (2883, 13),
     "calibration": (799, 3),
     "correction": (1766, 7),
     "emissivity": (448, 3),
@@ -22,11 +22,11 @@ BUDGET = {
     "limits": (732, 4),
     "readers": (2701, 12),
     "reporting": (404, 2),
-    "separation": (12831, 54),
+    "separation": (12931, 54),
     "simulation": (570, 3),
     "store": (1427, 6),
 }
-INSTALLED = 36_748  # lines of all rooms
+INSTALLED = 36_849  # lines of all rooms
 
 PRONOUNS = {
     *("one", "other", "others", "own", "part", "parts", "some", "here", "there", "told", "known"),
