@@ -166,7 +166,7 @@ def _blackbody(options: argparse.Namespace) -> xr.Dataset:
         movies.append(movie.rename(time="frame").expand_dims(temperature=[temperature]))
     # All temperatures have the frames of the shortest recording.
     number = min(movie.sizes["frame"] for movie in movies)
-    joined: Any = {"dim": "temperature", "combine_attrs": lambda them, **_: schema.origin(*them)}
+    joined: Any = {"dim": "temperature", "combine_attrs": lambda attrs, **_: schema.origin(*attrs)}
     counts = xr.concat([movie.isel(frame=slice(number)) for movie in movies], **joined)
     return counts.transpose("band", "temperature", "frame", "y", "x").sortby("temperature")
 

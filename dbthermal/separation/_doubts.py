@@ -41,7 +41,8 @@ def against_response(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
     noises = responses.noise(response, names) if "noise" in response else np.zeros(len(names))
     patterns = corrected["pattern_std"].values if "pattern_std" in corrected else 0.0
     stds = np.hypot(noises * schema.noise_factor(corrected), patterns)
-    ends = [it.counts([it.lowest, it.highest]) for it in responses.curves(response, names)]
+    curves = responses.curves(response, names)
+    ends = [curve.counts([curve.lowest, curve.highest]) for curve in curves]
     fitting = list[str]()  # the band of each, whose range the fewest samples lie outside
     for place, (name, film, std) in enumerate(zip(names, counts, stds, strict=True)):
         every = film[:: max(1, len(film) // _FRAMES), ::step, ::step].values[:, good]

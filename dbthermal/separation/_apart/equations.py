@@ -292,8 +292,8 @@ def change(inputs: Inputs, loose: Whole, result: xr.Dataset) -> Change:
     lagged = np.nan_to_num(np.clip(lagged / energy, 0.0, 0.98))
     frames, columns = functions.functions.shape
     variance = energy * columns / frames**2 * (1.0 + lagged) / (1.0 - lagged)
-    smoothed = bend[unlike] @ functions.functions @ functions.object_part.T
-    variance[unlike] += np.mean(smoothed**2, axis=1)
+    bend = bend[unlike] @ functions.functions @ functions.object_part.T
+    variance[unlike] += np.mean(bend**2, axis=1)
     # One that is not known, beside bad pixels, may be as large as any other.
     largest = film if unknown.all() else curves @ functions.object_part.T
     variance[unknown] = np.max(largest**2, initial=0.0)

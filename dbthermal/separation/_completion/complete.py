@@ -54,8 +54,9 @@ def complete(  # noqa: PLR0913 - all that is known beside the capture, by name
     .. math:: p(x, e, c, f \mid z) \propto p(z \mid x, e, c, f) \, p(e) \, p(c) \, p(f)
 
     The emissivities are those of the pixel, where measured; else those of its material elsewhere,
-    if the pixel does not contradict them by three deviations; else of the `prior`. Near black, the
-    result tends to the camera's own reading.
+    if the pixel does not contradict them by three deviations; else of the `prior`, of which the
+    library's lose those that would mirror less of the background's rapid changes than the pixel
+    shows. Near black, the result tends to the camera's own reading.
 
     Parameters
     ----------

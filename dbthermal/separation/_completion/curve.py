@@ -29,17 +29,13 @@ class Bins:
     time: Array  # (bin) [s]
 
     def rapid(self, noise: float) -> Array:
-        """Standard deviation (pixel) [K] of the first band about a smooth curve, less its noise.
-
-        NaN in a pixel without frames in a bin.
-        """
+        """Deviation (pixel) [K] of the first band about a smooth curve, less noise; NaN of gaps."""
         smooth = largest(self.time).functions
         rest = self.signals[0] - smooth @ (smooth.T @ self.signals[0])
         variance = (rest**2).sum(axis=0) / (len(smooth) - smooth.shape[1])
         with np.errstate(divide="ignore", invalid="ignore"):
             expected = noise**2 * np.mean(1.0 / self.frames, axis=0)
-            std = np.sqrt(np.maximum(variance - expected, 0.0))
-        return np.where(np.isinf(expected), np.nan, std)
+        return np.sqrt(np.maximum(np.where(np.isinf(expected), np.nan, variance - expected), 0.0))
 
 
 @dataclass(frozen=True)

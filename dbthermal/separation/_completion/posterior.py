@@ -11,7 +11,8 @@ fluctuation f(t), and any object at all:
    tells :math:`e_m / e_1` by its slope and c by where both bands agree, but never :math:`e_1`
    itself. A cubic in the base of its values at four nodes holds all that the bins say.
 2. For each :math:`e_1` on a grid the rest is linear and Gaussian: evidence, mean and covariance of
-   :math:`(e_m, c)` are closed forms, for each component of the prior. Their moments over the grid
+   :math:`(e_m, c)` are closed forms, for each component of the prior. Rapid changes, of which
+   :math:`1 - e_1` is mirrored, weigh the library's prior. Their moments over the grid
    are kept in :math:`a = 1 / e_1`, :math:`\rho_m = e_m / e_1` and c, in which s is nearly linear:
    :math:`s = c + a (z_1 - c)`. The mean of a is taken no farther from 1, the camera's own reading,
    than is no worse than that with a probability of 95 %.

@@ -267,9 +267,8 @@ def find_level(scene: Scene, sample: Sample) -> Level:
         # What measured pixels mirror of rapid changes: the fewer, the less it says of others.
         std = curves.bins(*part[:2]).rapid(tile.noise[0]) / (1.0 - scene.emissivity[0, part[-1]])
         if (std := std[scene.measured[part[-1]] & np.isfinite(std)]).size:
-            scatter = _SCATTER / np.sqrt(scene.measured.mean())
-            level = replace(scene.level, rapid=float(np.median(std)), scatter=float(scatter))
-            scene = replace(scene, level=level)
+            share = {"scatter": float(_SCATTER / np.sqrt(scene.measured.mean()))}
+            scene = replace(scene, level=replace(scene.level, rapid=float(np.median(std)), **share))
     if not estimates:
         return scene.level
     mean, after, before, fluctuation = np.concatenate(estimates, axis=1)
