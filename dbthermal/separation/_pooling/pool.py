@@ -263,8 +263,8 @@ def hold(
     pooling hardly makes its ratio more certain, and at the border of its material. With D the mean
     square of the difference of the objects in deviations of a pixel alone, its own or that around,
     the pooled variance is larger by D times that of the pixel alone, if that is no chance; of one
-    that tells nothing alone, by as much as around. That of a pixel `apart` which stays alone is so,
-    too. At one place this does not hold for a material
+    that tells nothing alone, by as much as around. So is that of a pixel `apart` that stays alone.
+    At one place this does not hold for a material
     most of whose moving pixels are gray alone: its others are selected by their noise.
     """
     sound, valid = (result["status"].values == 0 for result in (per_pixel, pooled))
@@ -288,7 +288,7 @@ def hold(
         square[row, columns] = np.nanmean(((value - lone) / std) ** 2, axis=0)
         variance[row, columns] = np.nanmean(std**2, axis=0)
         release()
-    unlike = square * (stay & apart)
+    unlike = square * (stay & apart & (square > _MORE))
     local = np.where(common, _neighbour_mean(square, common), 0.0)
     more = common & ((square > _MORE) | (local > _MORE_AROUND))
     square = np.where(more, np.maximum(square, local), 1.0 * (stay & sound))
