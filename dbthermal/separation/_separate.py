@@ -250,7 +250,8 @@ def _separated(
         inputs = replace(inputs, displacement=shift)
     # Separate each pixel.
     alone, surveys = separated(inputs, workers=workers, progress=progress)
-    doubts = [_UNEXPLAINED.format(share)] if share > 0.0 else _unexplained(alone)
+    doubts = [] if reflection_shift is None else _unexplained(alone)
+    doubts += [_UNEXPLAINED.format(share)] if share > 0.0 else []
     # Pool the pixels of each material, and hold them to what each tells by itself.
     result = alone
     pool = partial(separated, alone=alone, surveys=surveys, workers=workers, progress=progress)
@@ -309,10 +310,9 @@ def _shift(corrected: xr.Dataset, response: xr.Dataset) -> tuple[xr.Dataset | No
 
 
 def _unexplained(per_pixel: xr.Dataset) -> list[str]:
-    """Doubt about a shift of the reflections, or none, if bands are apart in many pixels."""
+    """Doubt about a shift of the reflections with which bands are apart in many pixels."""
     status = per_pixel["status"].values
-    other = schema.UNMEASURED | Status.NO_BACKGROUND_MOTION | Status.OBJECT_JUMP
-    moving = (status & np.uint32(other)) == 0
+    moving = (status & np.uint32(schema.UNMEASURED | Status.NO_BACKGROUND_MOTION)) == 0
     asynchronous = ((status & np.uint32(Status.BANDS_APART)) != 0) & moving
     share = asynchronous.sum() / max(moving.sum(), 1)
     return [_UNEXPLAINED.format(share)] if share > _MANY else []

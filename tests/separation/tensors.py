@@ -104,8 +104,15 @@ def _straighten(model: Model, material: Known, work: Work) -> None:
     work.bent = (energy > (pixel.BEND * model.noise[1:, None]) ** 2).any(dim=0)
     # Together pixels show a bend that is too small to be seen in each.
     stated = material["noise_variance"].isfinite() if material else torch.zeros_like(work.bent)
-    scatter, _ = _less_noise(model, _scatter(model, work.further)[1], work.order)
-    work.scatter = work.scatter.where(work.bent | stated, scatter)
+    scatter, free = _less_noise(model, _scatter(model, work.further)[1], work.order)
+    # The bend is that of a noisy background: what its noise is in the bands, less theirs alone.
+    slopes = _blackbody(model, work.background.mean(dim=0)[None])[1][:, 0]
+    dark = (1.0 - emissivity) / model.noise[:, None]
+    rate, other = dark * slopes, dark * (slopes - slopes[0])
+    shared = einsum("mp,kp->mkp", other, rate) + einsum("mp,kp->mkp", rate, other)
+    shared = (shared - einsum("mp,kp->mkp", other, other)) / (rate**2).sum(dim=0)
+    shared = free[:, None, None] * shared.where(physical, 0.0)
+    work.scatter = work.scatter.where(work.bent | stated, scatter) + shared
 
 
 def _blackbody(

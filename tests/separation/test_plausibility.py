@@ -79,14 +79,6 @@ def test_a_step_of_one_camera_is_told(glass_plate: Scene, band: int, kelvin: flo
     assert steps(partly.assign(counts=partly["counts"].where(kept))) == []
 
 
-def test_bands_apart_are_told_without_a_shift() -> None:
-    """A band that is blurred in time shows no quick reflection as the other does."""
-    capture, _ = seen(World(pace=(20.0, 40.0)), 1)
-    film = capture["counts"].values
-    film[1, 1:-1] = 0.5 * (film[1, :-2] + film[1, 2:])
-    assert any(one.startswith("The bands of") for one in said(capture, RESPONSE))
-
-
 def test_dead_rows_do_not_set_the_bands_apart() -> None:
     """Two rows that one camera does not see, and nobody marked, are theirs alone."""
     capture, _ = seen(World(), 1)
