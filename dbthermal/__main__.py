@@ -233,9 +233,9 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print the usage and the message, and exit."""
-        names = "': choose from " + ", ".join(self._option_string_actions)
+        names = ", ".join(self._option_string_actions)
         for wrong in re.findall(r"unrecognized arguments: (--\S+)", message):
-            message += suggestion(f"'{wrong}{names}")
+            message += suggestion(f"'{wrong}': choose from {names}")
         if self.epilog and re.match("unrecognized arguments: [^-]|the following", message):
             message += f". Must be as in: {self.epilog.splitlines()[1].strip()}"
         super().error(message + suggestion(message))

@@ -57,7 +57,7 @@ def against_response(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
                 f"{high:.0f} count that its response was calibrated over. Must lie within: "
                 "calibrate over the temperatures of the scene; or is it another band's response?"
             )
-    if not any(map(str.__eq__, names, fitting)):
+    if all(name != band for name, band in zip(names, fitting, strict=True)):
         rule = "are files of the bands exchanged, of the scene or of the blackbody?"
         sentences.insert(0, f"Counts of bands {names} fit the response of {fitting} better: {rule}")
     return sentences

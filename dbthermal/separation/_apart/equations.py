@@ -76,7 +76,7 @@ class Equations:
         for number, pixels in enumerate(self.ways):
             way[pixels], place[pixels] = number, np.arange(pixels.size)
         matrices = self.there, self.onward
-        there, onward = ((part.indptr, part.indices, part.data) for part in matrices)
+        there, onward = ((matrix.indptr, matrix.indices, matrix.data) for matrix in matrices)
         beyond = np.ascontiguousarray((self.onward @ self.shares[1:].T).T)
         moved = np.asarray(change / self.first[self.ways[relaxation.LOOSE], np.newaxis], np.float32)
         terms = relaxation.Terms(self.shares, self.bends, way, place, there, onward, beyond, moved)

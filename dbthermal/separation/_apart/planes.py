@@ -122,10 +122,8 @@ class Planes:
             for second in range(first, bands):
                 total = np.einsum("fp,fp->p", flat[first], flat[second])
                 # The noise of the background, which is the first band's, is in the bend of others.
-                shared = (
-                    (first == second) + bend[first] * bend[second] - (first == 0) * bend[second]
-                )
-                total = total / (noise[first] * noise[second]) - freedom * shared
+                share = (first == second) + bend[first] * bend[second] - (first == 0) * bend[second]
+                total = total / (noise[first] * noise[second]) - freedom * share
                 scatter[first, second] = scatter[second, first] = total
         usable = self.usable.ravel()
         scatter[..., ~usable] = 0.0

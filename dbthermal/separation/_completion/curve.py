@@ -31,8 +31,8 @@ class Bins:
     def rapid(self, noise: float) -> Array:
         """Deviation (pixel) [K] of the first band about a smooth curve, less noise; NaN of gaps."""
         smooth = largest(self.time).functions
-        rest = self.signals[0] - smooth @ (smooth.T @ self.signals[0])
-        variance = (rest**2).sum(axis=0) / (len(smooth) - smooth.shape[1])
+        residual = self.signals[0] - smooth @ (smooth.T @ self.signals[0])
+        variance = (residual**2).sum(axis=0) / (len(smooth) - smooth.shape[1])
         with np.errstate(divide="ignore", invalid="ignore"):
             expected = noise**2 * np.mean(1.0 / self.frames, axis=0)
         return np.sqrt(np.maximum(np.where(np.isinf(expected), np.nan, variance - expected), 0.0))
@@ -104,11 +104,11 @@ def curve(
 
 def _lagrange(places: Array) -> Array:
     """Cubics (node, ...) at places in [-1, 1] that are 1 at one of the nodes, 0 at the others."""
-    parts = []
+    cubics = []
     for node in _NODES:
-        others = _NODES[node != _NODES]
-        parts.append(np.prod([(places - one) / (node - one) for one in others], axis=0))
-    return np.asarray(parts)
+        roots = _NODES[node != _NODES]
+        cubics.append(np.prod([(places - root) / (node - root) for root in roots], axis=0))
+    return np.asarray(cubics)
 
 
 def _long_run(residual: Array, weight: Array, used: Array, noise: float) -> Array:

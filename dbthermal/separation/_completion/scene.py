@@ -213,7 +213,7 @@ def solve(
     with np.errstate(all="ignore"):
         constants = static.point, static.level, variance, static.covariance
         statics = frames.solve(tile, *constants, apart=scene.apart)
-        signal, left = windows.smooth(statics.signal, statics.white, valid, tile.time)
+        signal, remainder = windows.smooth(statics.signal, statics.white, valid, tile.time)
         background, spread = statics.background, statics.background_variance
         if (selected := np.isfinite(measured[0]).any(axis=0)).any():
             moments, block = static.select_pixels(selected), tile.select_pixels(selected)
@@ -224,7 +224,7 @@ def solve(
             for film, estimate in zip((background, spread), behind, strict=True):
                 film[:, selected] = np.where(seen, estimate, film[:, selected])
         values: Values = {}
-        films = (signal, left + statics.shared), (background, spread)
+        films = (signal, remainder + statics.shared), (background, spread)
         for name, (mean, deviation) in zip(FILMS, films, strict=True):
             pair = frames.temperatures(tile, np.where(valid, mean, np.nan), deviation)
             values[name], values[f"{name}_std"] = pair
@@ -258,17 +258,18 @@ def find_level(scene: Scene, sample: Sample) -> Level:
     for source in np.unique(sources[sources >= 0]):
         of_source = sources == source
         counted.append(np.full(of_source.sum(), 1.0 if source == OWN else 1.0 / of_source.sum()))
-        part = tile.select_pixels(of_source), valid[:, of_source], int(source), places[of_source]
-        static, fluctuation = solve_statics(scene, *part)
-        before = np.square(scene.level.at(places[of_source]).std)
+        block, numbers = (tile.select_pixels(of_source), valid[:, of_source]), places[of_source]
+        static, fluctuation = solve_statics(scene, *block, int(source), numbers)
+        before = np.square(scene.level.at(numbers).std)
         estimates.append([static.level, static.covariance[-1, -1], before, fluctuation])
         if source != OWN:
             continue
         # What measured pixels mirror of rapid changes: the fewer, the less it says of others.
-        std = curves.bins(*part[:2]).rapid(tile.noise[0]) / (1.0 - scene.emissivity[0, part[-1]])
-        if (std := std[scene.measured[part[-1]] & np.isfinite(std)]).size:
-            share = {"scatter": float(_SCATTER / np.sqrt(scene.measured.mean()))}
-            scene = replace(scene, level=replace(scene.level, rapid=float(np.median(std)), **share))
+        std = curves.bins(*block).rapid(tile.noise[0]) / (1.0 - scene.emissivity[0, numbers])
+        if (std := std[scene.measured[numbers] & np.isfinite(std)]).size:
+            scatter = _SCATTER / float(np.sqrt(scene.measured.mean()))
+            level = replace(scene.level, rapid=float(np.median(std)), scatter=scatter)
+            scene = replace(scene, level=level)
     if not estimates:
         return scene.level
     mean, after, before, fluctuation = np.concatenate(estimates, axis=1)

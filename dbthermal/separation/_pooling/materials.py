@@ -191,9 +191,9 @@ def others(labels: xr.DataArray, result: xr.Dataset) -> xr.DataArray:
     """Materials (y, x), and connected pixels of none of them as further labels."""
     telling = int(_UNUSABLE | Status.NO_BACKGROUND_MOTION)  # else it would agree with any
     free = (labels.values < 0) & ((result["status"].values & telling) == 0)
-    others = feature_maps.connected(free.astype(np.intp)) * free
-    others[np.bincount(others.ravel())[others] < _SMALLEST] = 0
-    numbers = np.unique(others, return_inverse=True)[1].reshape(others.shape)
+    regions = feature_maps.connected(free.astype(np.intp)) * free
+    regions[np.bincount(regions.ravel())[regions] < _SMALLEST] = 0
+    numbers = np.unique(regions, return_inverse=True)[1].reshape(regions.shape)
     return labels.copy(data=np.where(numbers > 0, labels.values.max() + numbers, labels))
 
 

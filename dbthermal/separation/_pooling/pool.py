@@ -264,8 +264,8 @@ def hold(
     square of the difference of the objects in deviations of a pixel alone, its own or that around,
     the pooled variance is larger by D times that of the pixel alone, if that is no chance; of one
     that tells nothing alone, by as much as around. So is that of a pixel `apart` that stays alone.
-    At one place this does not hold for a material
-    most of whose moving pixels are gray alone: its others are selected by their noise.
+    At one place this does not hold for a material most of whose moving pixels are gray alone: its
+    others are selected by their noise.
     """
     sound, valid = (result["status"].values == 0 for result in (per_pixel, pooled))
     stay = sound & (~valid | (labels.values < 0))
@@ -288,12 +288,12 @@ def hold(
         square[row, columns] = np.nanmean(((value - lone) / std) ** 2, axis=0)
         variance[row, columns] = np.nanmean(std**2, axis=0)
         release()
-    unlike = square * (stay & apart & (square > _MORE))
+    unlike = np.where(stay & apart & (square > _MORE), square, 0.0)
     local = np.where(common, _neighbour_mean(square, common), 0.0)
     more = common & ((square > _MORE) | (local > _MORE_AROUND))
     square = np.where(more, np.maximum(square, local), 1.0 * (stay & sound))
-    around = _neighbour_mean(square * variance, common | (stay & sound))
-    constant = np.where(valid & ~sound, around, 0.0)
+    mean = _neighbour_mean(square * variance, common | (stay & sound))
+    constant = np.where(valid & ~sound, mean, 0.0)
     factor, film = square * common, pooled["object_temperature_std"].values
     names = [name for name, variable in per_pixel.items() if "x" in variable.dims]
     maps = [(pooled[name].values, per_pixel[name].values) for name in names]
