@@ -28,7 +28,7 @@ from dbthermal.separation._tiles import Mask, Material, Whole
 _LARGEST: Final = 0.95  # share of an error that a step may leave
 # Emissivities by which x(p) is told: no closer to the ends of what the ratios leave [1].
 _MARGIN: Final = 0.02
-_DEGREE: Final = 4  # degree of the polynomial that the bend between two responses is
+_DEGREE: Final = 8  # degree of the polynomial that the bend between two responses is
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._pooling import pool
 from dbthermal.separation._pooling.ratios import Image
 from dbthermal.separation._quality import Bits
+from dbthermal.separation._subspace import reflection_ratio
 from dbthermal.separation._subspace.bars import NORMAL95
 from dbthermal.separation._subspace.reflection_ratio import energy_of_variance, principal_ratio
 from dbthermal.separation._tiles import BROKEN, Mask, Material, Survey
@@ -55,13 +56,22 @@ def ratios(inputs: Inputs, planes: Planes, status: Bits) -> Material:
 
     Their variance is times the reduced chi-square about the mean of those around. A pixel whose
     model does not hold takes that mean, with the variance of the ratios around beside their mean.
+    At the border of a material a blur mixes two: there a pixel's ratio is its sharp one.
     """
     noise, scatters = inputs.noise[inputs.bands], planes.scatters(BLUR)
     shape = (len(noise), *status.shape)
     ratio = scatters.ratio
     variance = scatters.variance(ratio)
     moving = planes.usable & ((status & np.uint32(Status.NO_BACKGROUND_MOTION)) == 0)
-    sound = moving & ~scatters.apart.reshape(status.shape)
+    # The blur changes the ratio by more than chance, and than it does around.
+    sharp = planes.scatters(0.0)
+    sharp_variance = sharp.variance(sharp.ratio)
+    change = ((sharp.ratio - ratio) ** 2 / sharp_variance)[1:].mean(axis=0).reshape(status.shape)
+    usual = np.maximum(_median(change, np.isfinite(change) * 1.0) / chdtri(1, 0.5), 1.0)
+    mixed = change > usual * chdtri(1, reflection_ratio.CHANCE)
+    sharp_variance *= usual.ravel()
+    mixed &= moving & ~sharp.apart.reshape(status.shape)
+    sound = moving & ~mixed & ~scatters.apart.reshape(status.shape)
     sound &= np.all(np.isfinite(variance), axis=0).reshape(status.shape)
     if inputs.difference is not None:  # else flags of the object say nothing
         sound &= (status & ~np.uint32(Status.CONSTANT_OBJECT)) == 0
@@ -71,11 +81,15 @@ def ratios(inputs: Inputs, planes: Planes, status: Bits) -> Material:
     mean = neighbour_mean(ratio, weight, _WIDE)
     chi = neighbour_mean(((ratio - mean) ** 2 * weight)[1:].mean(axis=0), sound, _WIDE)
     surrounded = gaussian_filter(sound * 1.0, _WIDE, mode="constant") > _SOME
-    doubtful = moving & ~sound & surrounded
+    doubtful = moving & ~sound & ~mixed & surrounded
     between = neighbour_mean((ratio - mean) ** 2, weight, _WIDE)
     variance = np.where(doubtful, between, variance * np.maximum(chi, 1))
-    ratio = np.where(doubtful, mean, np.where(sound, ratio, np.nan)).reshape(len(noise), -1)
-    inverse = energy_of_variance(ratio, variance.reshape(ratio.shape), noise)
+    ratio = np.where(doubtful, mean, np.where(sound, ratio, np.nan))
+    ratio, variance = (
+        np.where(mixed.ravel(), border, inner.reshape(len(noise), -1))
+        for border, inner in ((sharp.ratio, ratio), (sharp_variance, variance))
+    )
+    inverse = energy_of_variance(ratio, variance, noise)
     none = np.full(status.size, np.nan)
     return Material(ratio, inverse.mean(axis=0), none, none, none, np.zeros(status.size))
 
