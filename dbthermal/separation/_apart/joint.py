@@ -36,7 +36,7 @@ from dbthermal.separation._apart.planes import Planes
 from dbthermal.separation._apart.relaxation import Floats
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._subspace import regression
-from dbthermal.separation._subspace.reflection_ratio import null_combination
+from dbthermal.separation._subspace.reflection_ratio import null_combination, ratio_variance
 from dbthermal.separation._tiles import USELESS, Mask, Material, Whole
 
 _OBJECT: Final = ("object_temperature", "object_temperature_std")
@@ -199,7 +199,7 @@ def solve(
         change = system.change(inputs, equations.ways[relaxation.LOOSE], result)
         shares = system.coefficients(inputs, raw, solved)[:, places]
         if maps is not None:
-            target, size = _by_maps(inputs, maps, raw, material, places)
+            target, size = _by_maps(inputs, maps, raw, material, result, places)
         else:
             target, size = _by_film(inputs, result, raw, equations, shares, before)
 
@@ -282,7 +282,12 @@ Target: TypeAlias = Callable[[Whole], tuple[Floats, Floats]]
 
 
 def _by_maps(
-    inputs: Inputs, maps: Planes, raw: Floats, material: Material | None, places: Whole
+    inputs: Inputs,
+    maps: Planes,
+    raw: Floats,
+    material: Material | None,
+    result: xr.Dataset,
+    places: Whole,
 ) -> tuple[Target, Floats]:
     """Combination of the maps, and its deviation (solved) [K].
 
@@ -292,9 +297,11 @@ def _by_maps(
     ratio = system.ratio_of(raw)[:, places].astype(np.float64)
     weights = null_combination(ratio, noise)[0]
     combined, variance = maps.combined(weights, places)
-    if material is not None and np.isnan(material.emissivity).all():
-        std = np.sqrt(np.nan_to_num(material.inverse_energy[places]))
-        off = ratio + std * np.sqrt(noise[:, np.newaxis] ** 2 + (ratio * noise[0]) ** 2)
+    if material is not None:
+        std = result["reflection_ratio_std"].values[inputs.bands].reshape(len(noise), -1)[:, places]
+        inverse = material.inverse_energy[places]
+        std = np.where(np.isnan(inverse), std, np.sqrt(ratio_variance(ratio, inverse, noise)))
+        off = ratio + np.where(np.isnan(material.emissivity[places]), np.nan_to_num(std), 0.0)
         off[0] = 1.0
         change, _ = maps.combined(null_combination(off, noise)[0] - weights, places)
         variance = variance + np.mean((maps.object_part @ change) ** 2, axis=0)
@@ -433,6 +440,8 @@ def _factor(
     settled = power < _GROWN * size[:, 0] ** 2  # elsewhere the iteration grows
     # Over a few pixels: neighbours have nearly the same, and the draws are few.
     powers = np.where(settled, [power, size[:, 0] ** 2], 0.0).reshape(2, *displacement.shape)
-    energy, total = convolve(powers, np.ones((1, 3, 3))).reshape(2, -1)
-    factor = np.divide(energy, total, out=np.full_like(energy, np.nan), where=settled)
+    around, single = convolve(powers, np.ones((1, 3, 3))).reshape(2, -1), powers.reshape(2, -1)
+    factor, lone = (energy / np.where(settled, total, np.nan) for energy, total in (around, single))
+    # Not beside one that is far less certain, whose error it has a part of.
+    factor = np.where(lone > (1.0 + 3.0 * np.sqrt(2.0 / _DRAWS)) * factor, lone, factor)
     return np.where(sized, factor, 1.0)
