@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter, minimum_filter
+from scipy.ndimage import convolve, gaussian_filter, map_coordinates, maximum_filter, minimum_filter
 from scipy.special import chdtri, stdtrit
 
 from dbthermal._arrays import Array
@@ -47,6 +47,7 @@ _ALONG, _FEWEST = 4, 3
 # the pixels at borders are not seen, and those are 0.1 to 0.5 K off; one that is wrongly taken for
 # one loses only the precision of those around.
 _MIXED: Final = 0.01
+_TOGETHER: Final = 3  # of such pixels side by side: alone it may be beside a bad one
 # Share of a neighbourhood that tells the ratio of a pixel which does not, at least [1].
 _SOME: Final = 0.1
 # Deviation of the neighbourhood that tells an emissivity, over the image's smaller side.
@@ -71,6 +72,7 @@ def ratios(inputs: Inputs, planes: Planes, status: Bits) -> Material:
     change = ((border - ratio) ** 2 / of_border)[1:].mean(axis=0)
     usual = np.maximum(_median(change, np.isfinite(change) * 1.0) / chdtri(1, 0.5), 1.0)
     mixed = moving & (change > usual * chdtri(1, _MIXED)) & ~sharp.apart.reshape(status.shape)
+    mixed &= convolve(mixed * 1, np.ones((3, 3)), mode="constant") >= _TOGETHER
     sound = moving & ~mixed & ~blurred.apart.reshape(status.shape)
     sound &= np.all(np.isfinite(variance), axis=0)
     if inputs.difference is not None:  # else flags of the object say nothing
@@ -80,7 +82,7 @@ def ratios(inputs: Inputs, planes: Planes, status: Bits) -> Material:
     weight[0] = sound
     middle = np.stack([_median(*band) for band in zip(ratio, weight, strict=True)])
     square = (ratio - middle) ** 2
-    chi = _median((square * weight)[1:].mean(axis=0), sound * 1.0) / chdtri(1, 0.5)
+    chi = neighbour_mean((square * weight)[1:].mean(axis=0), sound, _WIDE)
     between = neighbour_mean(square, weight, _WIDE)
     surrounded = gaussian_filter(sound * 1.0, _WIDE, mode="constant") > _SOME
     cases = [mixed, sound, moving & surrounded]
