@@ -52,6 +52,9 @@ _NOT_COMPLETED: Final = (
     "their emissivities."
 )
 _MANY: Final = 0.3  # share of them from which a shift does not explain it
+# Share of them from which the clocks are compared: of scenes with one clock at most 0.003, beside
+# reflections at several depths; and what one clock must leave of it.
+_SOME, _LESS = 0.05, 0.5
 
 
 def separate(  # noqa: PLR0913 - all but the first two by name
@@ -155,7 +158,8 @@ def separate(  # noqa: PLR0913 - all but the first two by name
         )
 
     # Separate, and widen the bars by what is left.
-    capture, (measured, misfit), mended = _mended(laid.capture if laid else corrected, once)
+    capture, outcome, synchronised = _on_one_clock(laid.capture if laid else corrected, once)
+    capture, (measured, misfit), mended = _mended(capture, outcome, once)
     if laid:
         left = laid.detail(measured.inputs, measured.result)
         misfit = replace(misfit, change=np.hypot(misfit.change, left))
@@ -166,7 +170,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     misfits.widen(measured.inputs, result, misfit)
     # Complete what is still unknown.
     context = replace(context, materials=materials, reflection_shift=measured.reflection_shift)
-    doubts = measured.doubts + mended
+    doubts = measured.doubts + synchronised + mended
     if completable:
         result = filled(result, capture, response, context, workers)
     else:
@@ -181,15 +185,46 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     return warned(result.assign_attrs(reflection_shift=source), *unlike, *doubts)
 
 
-def _mended(
-    original: xr.Dataset, once: Callable[..., tuple["Measured", Misfit]]
+def _on_one_clock(
+    capture: xr.Dataset, once: Callable[..., tuple["Measured", Misfit]]
 ) -> tuple[xr.Dataset, tuple["Measured", Misfit], list[str]]:
-    """Separate; again, while what is left shows that cameras move, or that their blurs differ.
+    """Separate; again on one clock, if the bands show the same at different times.
+
+    Returns the capture on one clock, what was measured and what is left, and what was done.
+    """
+    outcome = once(capture)
+    names, share = capture["band"].values.tolist(), _asynchronous(outcome[0].result)
+    if share <= _SOME:
+        return capture, outcome, []
+    try:
+        aligned = alignment.align(capture, clock=names[0]).assign_coords(time=capture["time"])
+    except ValueError:  # nothing tells the clocks: the pixels keep the flag
+        return capture, outcome, []
+    retry = once(aligned)
+    if not _asynchronous(retry[0].result) < _LESS * share:
+        return capture, outcome, []
+    offsets, std = aligned.attrs["time_offset"][1:], aligned.attrs.get("time_offset_std", np.nan)
+    late = ", ".join(
+        f"'{band}' {offset:+.3f}" for band, offset in zip(names[1:], offsets, strict=True)
+    )
+    sentence = (
+        f"The clocks differ: frames were taken for {late} s later than those of '{names[0]}', "
+        f"known to {std:.3f} s, and interpolated to these."
+    )
+    return aligned, retry, [sentence]
+
+
+def _mended(
+    original: xr.Dataset,
+    outcome: tuple["Measured", Misfit],
+    once: Callable[..., tuple["Measured", Misfit]],
+) -> tuple[xr.Dataset, tuple["Measured", Misfit], list[str]]:
+    """Separate again, while what is left shows that cameras move, or that their blurs differ.
 
     Returns the capture as mended, what was measured and what is left, and what was done.
     """
     capture, motion, sentences, left = original, None, list[str](), np.zeros(())
-    measured, misfit = once(capture)
+    measured, misfit = outcome
     for _ in range(_ROUNDS):
         steady = stabilise(original, measured.inputs, measured.result, misfit, motion)
         retry = None if steady is None else once(steady.capture)
@@ -311,8 +346,13 @@ def _shift(corrected: xr.Dataset, response: xr.Dataset) -> tuple[xr.Dataset | No
 
 def _unexplained(per_pixel: xr.Dataset) -> list[str]:
     """Doubt about a shift of the reflections with which bands are apart in many pixels."""
-    status = per_pixel["status"].values
+    share = _asynchronous(per_pixel)
+    return [_UNEXPLAINED.format(share)] if share > _MANY else []
+
+
+def _asynchronous(result: xr.Dataset) -> float:
+    """Share of the pixels with moving reflections whose bands do not show the same."""
+    status = result["status"].values
     moving = (status & np.uint32(schema.UNMEASURED | Status.NO_BACKGROUND_MOTION)) == 0
     asynchronous = ((status & np.uint32(Status.BANDS_APART)) != 0) & moving
-    share = asynchronous.sum() / max(moving.sum(), 1)
-    return [_UNEXPLAINED.format(share)] if share > _MANY else []
+    return float(asynchronous.sum() / max(moving.sum(), 1))
