@@ -561,6 +561,7 @@ separate aligned.zarr response.zarr --method calibrated --emissivity 1 -o x.zarr
  -> Must be one for each
 separate aligned.zarr response.zarr --offset nan -o x.zarr -> --offset: Invalid number 'nan'
 plan --noise 30mK -> argument --noise: Invalid number '30mK'. Must be digits
+plan --noise -0.03 -> Invalid noise .K. -0.03. Must be finite and positive
 plan --noise 30 -> Invalid noise 30 K. Must be below 5 K: 30 mK are 0.03 K
 calibrate a5.tif b5.tif -o x.zarr -> arguments: a5.tif b5.tif. .* dbthermal calibrate --at 10C a
 calibrate a5.tif b5.tif -> required: -o/--output. .* dbthermal calibrate --at 10C a10.tif
@@ -598,6 +599,7 @@ plan glass --noise 0.03 -> Did you mean 'plate window glass'
 complete a b c --surroundings 278C -o d.zarr -> Warning: 278C is 551.15 K; kelvin are written 278K
 complete a b c --surroundings 22K -o d.zarr -> 22K is -251.15 degrees .* are written 22C
 calibrate --at 5c a.tif b.tif -o a.zarr -> temperature '5c'. Must be a number, with a decimal point
+separate aligned.zarr response.zarr --surroundings -300C -o x.zarr -> surroundings .K. -26.85. Must
 """.replace("\n -", " -").strip()
 UNUSED = f"""
 import scene.zarr --unit K -o x.zarr -> unit a store
@@ -672,6 +674,21 @@ def test_the_explorer_says_what_it_lacks(results: Path, monkeypatch: pytest.Monk
             absent.setitem(sys.modules, missing, None)
             _, out, _ = said(results, *command)
         assert "opened by, in a clone: python -m pip install '.[explorer]' jupyter" in out
+
+
+def test_a_temperature_in_words_is_no_file(tmp_path: Path) -> None:
+    """Units with a blank are explained; the name of a file that begins with digits is a name."""
+    for text in ("5 degC", "5 degrees C", "5degC"):
+        _, _, error = said(tmp_path, "calibrate", "--at", text, "a.tif", "b.tif", "-o", "x.zarr")
+        assert f"Invalid temperature '{text}'. Must be a number, with a decimal point" in error
+    line = refused(tmp_path, "calibrate", "--at", "5C", "25.csq", "25.tif", "-o", "x.zarr")
+    assert "No file or folder '25.csq'" in line
+
+
+def test_a_material_named_twice_is_planned_once(tmp_path: Path) -> None:
+    """Its numbers are those of the material named once."""
+    command = ["plan", "--noise", "0.03"]
+    assert done(tmp_path, *command, "water", "water") == done(tmp_path, *command, "water")
 
 
 def test_a_warning_is_said_once(results: Path) -> None:

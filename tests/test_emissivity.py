@@ -160,7 +160,7 @@ def test_noise_behind_filters() -> None:
     expected = [0.03, 0.279, 0.299, 0.113, 0.420]  # from the integral of dL/dT over each band
     np.testing.assert_allclose(noise, expected, rtol=0, atol=0.0005)
     assert noise.attrs["units"] == "K"
-    with pytest.raises(ValueError, match=re.escape("Invalid netd [K] -0.03")):
+    with pytest.raises(ValueError, match=re.escape("Invalid noise [K] -0.03")):
         emissivity.filter_noise(-0.03, FILTERS)
 
 
@@ -213,7 +213,7 @@ def test_tables_that_rank_no_filter(
         condition_numbers(table(m=[0.9]))
     with pytest.raises(TypeError, match="Invalid condition numbers of type ndarray"):
         pair_summary(np.ones(3))  # type: ignore[arg-type]
-    with pytest.raises(TypeError, match=r"Invalid netd \[K\] '0.03'"):
+    with pytest.raises(TypeError, match=r"Invalid noise \[K\] '0.03'"):
         emissivity.filter_noise("0.03", ["8-14"])  # type: ignore[arg-type]
 
 

@@ -65,7 +65,7 @@ def kelvin(text: str) -> float:
     """Temperature [K] of a text with its unit; 273.15 as in scipy, whose import takes long."""
     try:
         value, unit = finite(text[:-1]), text[-1:]
-        temperature = value + {"C": 273.15, "K": 0.0}[unit]
+        temperature = round(value + {"C": 273.15, "K": 0.0}[unit], 9)
     except (KeyError, ArgumentTypeError) as error:
         rule = "Must be a number, with a decimal point, and its unit, such as 20.5C or 293.15K"
         raise ArgumentTypeError(f"Invalid temperature '{text}'. {rule}.") from error
@@ -79,7 +79,7 @@ def kelvin(text: str) -> float:
 
 def kelvin_or_path(text: str) -> float | Path:
     """Temperature, or the path of a file."""
-    return kelvin(text) if re.fullmatch(r"[-+\d.,]+ ?\W?[A-Za-z]?", text) else Path(text)
+    return kelvin(text) if re.fullmatch(r"[-+\d.,]+ ?(deg\w* ?)?\W?[A-Za-z]?", text) else Path(text)
 
 
 def sources_and_targets(options: Namespace) -> tuple[list[Path], list[Path]]:

@@ -300,7 +300,7 @@ def plan(options: argparse.Namespace) -> dict[str, Any]:
         names = table["material"].values.tolist()
         for name in (name for name in options.materials if name not in names):
             raise ValueError(f"Unknown material '{name}'. Must be one of {names}.")
-        table = table.sel(material=options.materials)
+        table = table.sel(material=[*dict.fromkeys(options.materials)])
     # Plan of the capture, and its best filter by material.
     level = {"level": SKY_LEVEL} if options.outdoors else {}
     design = limits.CaptureDesign(**accepted(limits.CaptureDesign, options), **level)

@@ -283,7 +283,7 @@ def filter_noise(netd: float, bands: Bands) -> xr.DataArray:
     [0.04, 0.398, 0.15]
     """
     chosen = chosen_bands(bands)
-    netd = _numbers.real_number("netd [K]", netd, _numbers.POSITIVE)
+    netd = _numbers.real_number("noise [K]", netd, _numbers.POSITIVE)
     if netd >= _LIMIT:
         raise ValueError(f"Invalid noise {netd:g} K. Must be below {_LIMIT:g} K: 30 mK are 0.03 K.")
     slopes = np.array([float(band.slope(_TEMPERATURE)) for band in chosen])

@@ -16,9 +16,9 @@ from dbthermal.readers._recording import MEMORY, Clock
 # Names of dims by their place, and those of an array without names, of any case.
 _DIMS: Final = ("time|t|frames?|images?", "y|rows?|height", "x|col(umn)?s?|width")
 _WITHOUT_NAME: Final = r"||None|(phony_)?dim_\d+"
+_NEUTRAL: Final = {"scale_factor": 1, "scale": 1, "slope": 1, "add_offset": 0, "intercept": 0}
 _ATTRIBUTES: Final = (
-    *("units", "unit", "scale_factor", "add_offset", "_FillValue", "missing_value", "origin"),
-    "_Unsigned",
+    *("units", "unit", *_NEUTRAL, "_FillValue", "missing_value", "origin", "_Unsigned"),
 )
 
 
@@ -107,10 +107,10 @@ def _checked(values: Any, label: str, unit: str) -> dict[str, Any]:
             raise ValueError(f"Invalid dims {_containers.dims_of(values)} of '{label}'. {rule}.")
     texts = {name: _containers.attribute(values, name) for name in _ATTRIBUTES}
     attributes = {name: text for name, text in texts.items() if text is not None}
-    for scale, neutral in {"scale_factor": 1.0, "add_offset": 0.0}.items():
-        if attributes.get(scale, neutral) != neutral:
-            rule = f"Must be {neutral:g}: counts as measured"
-            raise ValueError(f"Invalid '{scale}' of '{label}'. {rule}.")
+    for scale, neutral in _NEUTRAL.items():
+        if np.any((value := attributes.get(scale, neutral)) != neutral):
+            rule = f"Must be {neutral}: counts as measured"
+            raise ValueError(f"Invalid '{scale}' of '{label}', {value}. {rule}.")
     dtype = np.dtype(getattr(values, "dtype", object))
     unsigned = str(attributes.get("_Unsigned", "")).lower() in {"true", "1"}
     if dtype.itemsize != 2 or dtype.kind not in ("iu" if unsigned else "u"):

@@ -165,7 +165,7 @@ def _filters(array: Any, path: Path) -> list[int]:
     packers = [code for code in codes if code not in {_SHUFFLE, _SUM}]
     if len(packers) > 1 or not {*packers} <= _PACKERS.keys():
         rule = f"Must be shuffle, then one of {[*_PACKERS]}, as of h5repack -f GZIP=1"
-        raise ValueError(f"Invalid filters {codes} of '{array.name}'. {rule}.")
+        raise ValueError(f"Invalid filters {codes} of '{array.name}' of '{path.name}'. {rule}.")
     if not all(map(h5py.h5z.filter_avail, codes)):
         with suppress(ImportError):
             import_module("hdf5plugin")

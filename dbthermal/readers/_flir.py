@@ -242,13 +242,12 @@ def _order(counts: Counts, form: _Image, stated: str | None, name: str) -> tuple
     if order != (stated or order) or (decided == "smoothness" and sign < 0):
         counts.byteswap(inplace=True)
         order, sign = "little" if order == "big" else "big", -sign
-    label = "its images are smoother with their bytes swapped"
+    label = f"'{name}': its images are smoother with their bytes swapped"
     if stated and sign < 0:
-        rule = "Must be the other one"
-        raise ValueError(f"Invalid byte_order '{stated}' for '{name}': {label}. {rule}.")
+        raise ValueError(f"Invalid byte_order '{stated}' for {label}. Must be the other one.")
     if not stated and ((sign == 0 and not form.order) or sign < 0):
         rule = "Must be stated: byte_order='little' or 'big'"
-        raise ValueError(f"Unclear byte order in '{name}': {label}, or as smooth. {rule}.")
+        raise ValueError(f"Unclear byte order in {label}, or as smooth. {rule}.")
     return order, decided
 
 

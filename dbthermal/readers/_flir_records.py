@@ -97,10 +97,9 @@ def of_jpeg(content: Content, name: str) -> bytes:
         if marker == 0xE1 and content[start : start + len(_SEGMENT)] == _SEGMENT
     ]
     if not payloads:
-        raise ValueError(
-            f"No thermal data of FLIR in '{name}', an ordinary JPEG or one of another maker. Must "
-            "be a radiometric JPEG; else export 16-bit counts as TIFF and use readers.tiff."
-        )
+        label = f"'{name}', an ordinary JPEG or one of another maker"
+        rule = "Must be a radiometric JPEG; else export 16-bit counts as TIFF and use readers.tiff"
+        raise ValueError(f"No thermal data of FLIR in {label}. {rule}.")
     numbers = [tuple(payload[6:8]) for payload in payloads]
     if numbers != [(i, numbers[0][-1]) for i in range(numbers[0][-1] + 1)] or len(payloads[-1]) < 8:
         label = f"FLIR segments {[i for i, *_ in numbers]}"
@@ -129,9 +128,8 @@ def _frame(content: Content, at: int, place: str) -> tuple[Frame, int]:
         raise ValueError(f"Damaged file: {label}. {rule}.")
     records, spans = {}, [(directory, listed)]
     for entry in range(directory, listed, _ENTRY):
-        kind, *_, start, length, _, _, checksum = struct.unpack_from(
-            f"{orders[0]}HHIIIIIII", content, at + entry
-        )
+        numbers = struct.unpack_from(f"{orders[0]}HHIIIIIII", content, at + entry)
+        kind, start, length, checksum = numbers[0], *numbers[4:6], numbers[-1]
         if not kind or not length:
             continue
         spans.append((start, start + length))

@@ -5,7 +5,7 @@ import re
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from importlib import import_module
@@ -36,8 +36,7 @@ DAMAGE: Final = (
     *(RuntimeError, SyntaxError, SystemError, TypeError, ValueError, Warning, TokenError),
     *(lzma.LZMAError, struct.error, zipfile.BadZipFile, zlib.error),
 )
-# An image is smoother than with its bytes swapped, or its rows cut at another place, by this
-# factor, or the form is not known.
+# Factor by which an image is smoother than with bytes swapped or rows cut elsewhere, or unclear.
 _SMOOTHER: Final = 2.0
 _ALONG: Final = 64  # samples along each axis that tell which of them is time
 _APART: Final = 1.3  # axes whose roughness differs by this factor are of another kind
@@ -74,23 +73,26 @@ class FileFlag(schema.Flags):
     NUMBERS_DIFFER = 8, "image and time are of frames of different numbers"
 
 
-def numbered(paths: Sequence[Path]) -> Array | None:
-    """Places in time of files with a frame each [frame], by their names; None without a gap."""
+def numbered(paths: Sequence[Path]) -> tuple[Array | None, float]:
+    """Places in time [file], None without a gap; usual step of dates [s], 0 without; by names."""
     numbers = [[int(digits) for digits in re.findall("[0-9]+", path.stem)] for path in paths]
     if len({*map(len, numbers)}) > 1 or len(paths) < 3:
-        return None
+        return None, 0.0
     table = np.array(numbers, dtype=np.float64)
     moments = np.array([_moment(path.stem) for path in paths])
     is_dated, counting = np.isfinite(moments).all(), np.flatnonzero(np.ptp(table, axis=0))
     if not is_dated and counting.size != 1:  # parts of a recording
-        return None
+        return None, 0.0
     # Whole multiples of the usual step are frames that are missing; dates are right to a part.
     steps = np.diff(moments if is_dated else table[:, counting[0]])
-    places = np.rint(apart := steps / (np.percentile(steps, 50, method="lower") or 1.0))
+    usual = float(np.percentile(steps, 50, method="lower") or 1.0)
+    places = np.rint(apart := steps / usual)
     near = np.abs(apart - places).max() < _JITTER and places.min() > 0
     exact = not is_dated and np.array_equal(apart, places)
-    gaps = places.max() > _GAP and (exact or (near and places.sum() < 2 * len(paths)))
-    return np.cumsum(np.append(0.0, places)) if gaps else None
+    near &= places.sum() < 2 * len(paths)
+    gaps = places.max() > _GAP and (exact or near)
+    is_clock = is_dated and near and steps.sum() > 1.0  # no counter behind a date
+    return np.cumsum(np.append(0.0, places)) if gaps else None, is_clock * usual
 
 
 def _moment(stem: str) -> float:
@@ -131,7 +133,7 @@ def check_number(value: Any, name: str, *, whole: bool = False) -> None:
 def check_present(counts: Counts, fills: Sequence[Any], name: str) -> None:
     """Raise ValueError where counts are values that stand for missing ones."""
     if fills and any(np.isin(counts[at], fills).any() for at in parts(counts)):
-        raise ValueError(f"Missing counts in '{name}': {fills}. Must all be there.")
+        raise ValueError(f"Missing counts in '{name}': {[*map(float, fills)]}. Must all be there.")
 
 
 def check_memory(shape: Sequence[int], memory: float, name: str, stored: float = np.inf) -> None:
@@ -172,16 +174,16 @@ def film(values: Any) -> Counts:
     return counts
 
 
-def smoother(counts: Counts, rearranged: Callable[[Counts], Counts] = np.ndarray.byteswap) -> int:
-    """Form in which the first clear frame is smoother: 1 as it is, -1 the other, 0 unclear."""
-    for frame in counts:
+def smoother(images: Iterable[Any], rearranged: Callable[[Any], Any] = np.ndarray.byteswap) -> int:
+    """Form in which the first clear image is smoother: 1 as it is, -1 the other, 0 unclear."""
+    for frame in images:
         as_is, swapped = _roughness(frame), _roughness(rearranged(frame))
         if sign := int(_SMOOTHER * as_is < swapped) - int(_SMOOTHER * swapped < as_is):
             return sign
     return 0
 
 
-def _roughness(frame: Counts) -> float:
+def _roughness(frame: npt.NDArray[Any]) -> float:
     values = frame.astype(np.int32)
     return sum(float(np.abs(np.diff(values, axis=axis)).sum()) for axis in (0, 1))
 
@@ -220,7 +222,7 @@ def check_times(values: npt.NDArray[Any], unit: str, clock: Clock | None, name: 
         step = abs(float(values[-1]) - float(values[0])) / max(len(values) - 1, 1)
         if clock is None and not _STEPS[0] < step < _STEPS[1]:  # at 1: numbers of frames?
             label = f"Missing unit of the times of '{name}', which rise by {step:g} a frame"
-            raise ValueError(f"{label}. Must be s, ms, us, ns; or state the frame rate by clock=.")
+            raise ValueError(f"{label}. Must be s, ms, us, ns; or state the rate, clock= [Hz].")
     if not scales:
         raise ValueError(f"Invalid units '{unit}' of the times of '{name}'. Must be s, ms, us, ns.")
     apart = values.astype(np.float64) - float(values[0])
@@ -234,7 +236,7 @@ def check_times(values: npt.NDArray[Any], unit: str, clock: Clock | None, name: 
         rule = "Must agree to half a frame, and rise; without clock= those of the file are taken"
         if not rises[first]:
             mismatch = f"frame {first} at {seconds[first]:g} s, after {seconds[first - 1]:g} s"
-            rule = "Must rise: correct them, or save the counts without them and state clock="
+            rule = "Must rise: correct them, or save the counts without them and state clock= [Hz]"
         raise ValueError(f"Invalid times of '{name}': {mismatch}. {rule}.")
     return np.asarray(seconds)
 
@@ -249,8 +251,8 @@ def byte_order(name: str, value: str) -> str:
 def stamps(clock: Clock | None, frames: int, name: str) -> Array:
     """Times (time) [s] of frames, from a frame rate [Hz] or from their times [s]."""
     if clock is None:
-        rule = "Must be the frame rate [Hz], or the time of each frame [s]"
-        raise ValueError(f"Missing clock= for '{name}', which tells no times. {rule}.")
+        rule = "Must be the frame rate [Hz], or the time of each frame [s], in a file as ISO 8601"
+        raise ValueError(f"Missing clock= for '{name}', which tells no times. {rule} or numbers.")
     stated = schema.check_numbers(xr.DataArray(clock), f"the clock of '{name}'", "s")
     values = stated.values.astype(np.float64)
     rule = f"Must be a rate in (0, {_FASTEST:g}] Hz, or one finite time each in s"

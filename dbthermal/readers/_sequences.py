@@ -86,10 +86,12 @@ def raw(
         rule = "Must be the other byte order, or another shape or header"
         raise ValueError(f"Invalid counts of '{name}': rougher than with bytes swapped. {rule}.")
     if _are_longer(counts) or (sign == 0 and np.ptp(counts[0])):
-        rule = "16-bit counts, smoother than with bytes swapped, not of 8 or 32 bits or packed"
-        label = f"Invalid counts of '{name}': no images of 16-bit numbers"
-        raise ValueError(f"{label}. Must be {rule}.")
-    if _recording.smoother(counts[:_FIRST], lambda frame: frame.reshape(shape[::-1])) < 0:
+        rule = "Must be smoother than with bytes swapped, not of 8 or 32 bits or packed"
+        raise ValueError(f"Invalid counts of '{name}': no images of 16-bit numbers. {rule}.")
+    # What changes is smoother than the pattern of the pixels, and tells rows from columns.
+    further = counts[:: -(-len(counts) // _FIRST)].astype(np.int32)
+    images = [*counts[:_FIRST], *(further[1:] - further[0])]
+    if _recording.smoother(images, lambda frame: frame.reshape(shape[::-1])) < 0:
         rule = "Must be rows, then columns"
         raise ValueError(f"Invalid shape {shape} of '{name}': rougher than {shape[::-1]}. {rule}.")
     decided = {"byte_order": byte_order, "byte_order_by": "caller"}
@@ -168,7 +170,7 @@ def _sfmov(path: Path, memory: float) -> tuple[Counts, Array | None]:
     if not re.fullmatch(rb"[ \0]*\r?\n?", content[behind : max(start, 0)]) or start < behind:
         label = f"{size - behind} bytes behind DATA of '{path.name}'"
         rule = f"Must be {frames} frames of {rows} x {columns}, or be read by readers.raw"
-        raise ValueError(f"Truncated or damaged: {label}. {rule} with header=.")
+        raise ValueError(f"Truncated or damaged: {label}. {rule} with header= [byte].")
     counts = np.memmap(path, "<u2", "r", start, (frames, rows, columns))
     notes = path.with_suffix(".inc")
     is_short = notes.is_file() and notes.stat().st_size <= _LONGEST

@@ -97,8 +97,8 @@ def tiff(
     Warns
     -----
     UserWarning
-        If a description has another frame rate, which may be that of playing it, numbers or dates
-        of files are left out, a frame is there twice, or another axis than the first may be time.
+        If dates or a description have another rate, which may be of playing it, numbers or dates of
+        files are left out, a frame is there twice, or another axis than the first may be time.
 
     Examples
     --------
@@ -123,9 +123,12 @@ def tiff(
     stored = sum(length for page in pages for _, length in page.spans)
     _recording.check_memory(shape, memory, name, stored)
     seconds, sentences = _times(pages[0].description, shape[0], clock, name)
-    places = _recording.numbered(paths) if np.ndim(np.asarray(clock)) == 0 else None
+    places, step = _recording.numbered(paths) if np.ndim(np.asarray(clock)) == 0 else (None, 0.0)
     groups = groupby(pages, attrgetter("path"))
     size, *lengths = (sum(page.images for page in group) for _, group in groups)
+    if step and abs(step / (size * seconds[1]) - 1) > 0.5:  # as of times in a file
+        label = f"The dates of '{name}' are {step:.3g} s apart, {size * seconds[1]:.3g} s by clock="
+        sentences.append(f"{label}. Must be the rate of recording.")
     if places is not None and {*lengths[:-1]} <= {size}:  # the last stack may be shorter
         spans = zip(size * places, (size, *lengths), strict=True)
         numbers = np.concatenate([first + np.arange(length) for first, length in spans])

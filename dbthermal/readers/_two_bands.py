@@ -149,8 +149,7 @@ def _names(bands: Any, number: int) -> list[str]:
     listed = bands if isinstance(bands, Sequence) and not isinstance(bands, str) else []
     names = [str(name) for name in listed if isinstance(name, str) and name.strip()]
     if not len({*names}) == len(listed) == number:
-        label = {2: "two", 3: "three"}.get(number, number)
-        raise ValueError(f"Invalid bands {bands!r}. Must be {label} different names, as texts.")
+        raise ValueError(f"Invalid bands {bands!r}. Must be {number} different names, as texts.")
     return names
 
 

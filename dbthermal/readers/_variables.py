@@ -75,9 +75,8 @@ class Stream(Unread):
                 counts[frames].byteswap(inplace=True)
         size += len(self.stream.read(1))
         if size != counts.nbytes:
-            actual = f"{size} bytes or more of counts in '{self.name}'"
-            rule = f"Must be {counts.nbytes}, by its header"
-            raise ValueError(f"Truncated or damaged {actual}. {rule}.")
+            label = f"{size} bytes or more of counts in '{self.name}'"
+            raise ValueError(f"Truncated or damaged {label}. Must be {counts.nbytes}, as stated.")
         return counts.T if self.by_columns else counts
 
 
@@ -183,9 +182,8 @@ def _variable(
     if length != stored.itemsize * math.prod(shape) or begin + length > 8 + whole:
         rule = f"Must be {stored.itemsize} x {shape}, within its {whole}"
         raise ValueError(f"{length} bytes of '{name}'. {rule}.")
-    return Numbers(
-        path, name, shape, np.dtype(form), stored, span, begin, 8 + whole if packed else 0
-    )
+    unpacked = 8 + whole if packed else 0
+    return Numbers(path, name, shape, np.dtype(form), stored, span, begin, unpacked)
 
 
 def _elements(head: bytes, order: str) -> Iterator[tuple[int, int, int]]:
@@ -230,10 +228,9 @@ def netcdf_arrays(path: Path) -> dict[str, xr.Variable]:
     content, listed = np.memmap(path, "u1", "r"), dict[str, xr.Variable]()
     for name, (dims, attrs, start, shape, dtype) in forms.items():
         steps = [math.prod(shape[axis + 1 :]) * dtype.itemsize for axis in range(len(shape))]
-        over, strides = (
-            ([records, *shape], [record, *steps]) if name in recorded else (shape, steps)
-        )
-        values = np.ndarray(over, dtype, content.data, start, strides)
+        first = [records] if name in recorded else []
+        strides = [record] * len(first) + steps
+        values = np.ndarray([*first, *shape], dtype, content.data, start, strides)
         listed[name] = xr.Variable(dims, values, attrs)
     return listed
 

@@ -82,7 +82,10 @@ MILLISECONDS = xr.DataArray(100.0 * np.arange(3), dims="time", attrs={"units": "
         (FRAMES.astype("i4"), {}, r"Invalid dtype int32 of 'array'\. Must be uint16"),
         (FRAMES.assign_attrs(units="K"), {}, "Invalid unit 'K' of 'array'"),
         (FRAMES.assign_attrs(unit="K"), {}, "Invalid unit 'K' of 'array'"),
-        (FRAMES.assign_attrs(scale_factor=0.01), {}, "Invalid 'scale_factor' of 'array'"),
+        (FRAMES.assign_attrs(scale_factor=0.01), {}, "Invalid 'scale_factor' of 'array', 0.01"),
+        (FRAMES.assign_attrs(scale=0.01), {}, "Invalid 'scale' of 'array', 0.01. Must be 1"),
+        (FRAMES.assign_attrs(slope=[1.0, 0.9]), {}, "Invalid 'slope' of 'array'"),
+        (FRAMES.assign_attrs(Intercept=-273.15), {}, "Invalid 'intercept' of 'array', -273.15"),
         (np.ma.masked_equal(scene(), scene()[1, 2, 3]), {}, "Missing counts in 'array': masked"),
         (scene()[0], {}, r"Invalid shape \(24, 32\) of 'array'"),
         (
@@ -243,7 +246,7 @@ def test_missing_counts_of_a_file(tmp_path: Path) -> None:
     frames.attrs["_FillValue"] = 0
     assert_array_equal(read(tmp_path / "a.zarr").counts, scene())
     frames.attrs["_FillValue"] = int(scene()[1, 2, 3])
-    with pytest.raises(ValueError, match=r"Missing counts in 'a\.zarr': .* Must all be there"):
+    with pytest.raises(ValueError, match=r"Missing counts in 'a\.zarr': \[[\d.]+\]\. Must all"):
         read(tmp_path / "a.zarr")
 
 
@@ -462,7 +465,7 @@ def test_filters_of_hdf5(tmp_path: Path) -> None:
     assert_array_equal(read(chunked(path, zlib.compress(values), {1: (6,)})).counts, scene())
     with pytest.raises(ValueError, match=r"Missing filter 32001, .*python -m pip install hdf5plug"):
         read(chunked(path, values, {32001000: ()}))
-    with pytest.raises(ValueError, match=r"Invalid filters \[1, 1\] .* Must be shuffle, then one"):
+    with pytest.raises(ValueError, match=r"^Invalid filters \[1, 1\] .* Must be shuffle, then"):
         read(chunked(path, zlib.compress(zlib.compress(values)), {1: (6,), 1001: (6,)}))
     with pytest.raises(ValueError, match=r"Invalid chunk of 'frames' .* Must unpack to 4608"):
         read(chunked(path, zlib.compress(values + bytes(10**8)), {1: (6,)}))

@@ -128,6 +128,18 @@ def test_raw(tmp_path: Path) -> None:
     path.write_bytes(counts.tobytes())
     with pytest.raises(ValueError, match=r"Invalid shape \(32, 24\) .*: rougher than \(24, 32\)"):
         bare(path, shape=(32, 24))
+    # So are rows and columns of pixels that differ more than the scene, if the scene changes.
+    rng = np.random.default_rng(1)
+    pattern, noise = rng.integers(0, 4000, (24, 32)), rng.normal(0.0, 3.0, (20, 24, 32))
+    warming = np.einsum("t,y,x->tyx", np.arange(20), np.arange(24), np.linspace(0.0, 1.0, 32))
+    for rise, is_told in ((warming, True), (np.zeros(1), False)):
+        path.write_bytes((20000 + pattern + rise + noise).astype("<u2").tobytes())
+        assert bare(path).sizes["y"] == 24
+        if not is_told:
+            assert bare(path, shape=(32, 24)).sizes["y"] == 32  # of a scene at rest
+            continue
+        with pytest.raises(ValueError, match=r"Invalid shape \(32, 24\) .*: rougher than"):
+            bare(path, shape=(32, 24))
     path.write_bytes(counts.astype(">u2").tobytes())
     with pytest.raises(ValueError, match=r"Invalid shape \(1000000, .* of less than 2 GB"):
         bare(path, shape=(1_000_000, 1_000_000))

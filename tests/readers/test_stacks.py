@@ -128,15 +128,27 @@ def test_dates_in_names_are_gaps_in_time(tmp_path: Path, form: str) -> None:
     assert_allclose(made["exposure_time"], [0.0, 0.1, 0.2, 0.6, 0.7], atol=1e-9)  # [s]
 
 
+def test_dates_in_names_contradict_the_clock(tmp_path: Path) -> None:
+    """Dates whose rate is not that of the clock are a warning, as of a wrong frame rate."""
+    paths = [tmp_path / f"a_20241027_1559{second:06.3f}.tif" for second in np.arange(57, 59, 0.1)]
+    for path, image in zip(paths, scene(20), strict=True):
+        write(path, image)
+    read(paths)
+    with pytest.warns(UserWarning, match=r"dates of 'a_.* are 0\.1 s apart, 0\.2 s by clock="):
+        made = read(paths, clock=5.0)
+    assert_allclose(made["exposure_time"][:2], [0.0, 0.2])  # [s]
+
+
 def test_names_without_gaps(tmp_path: Path) -> None:
     """Full minutes, counters behind dates, and dates that are none; a copy is warned of."""
     whole = [f"20241027_{time}" for time in (155958, 155959, 160000, 160001)]
     counted = [f"20241027_155958_{number:03}" for number in (7, 8, 9)] + ["20241027_155959_010"]
-    for names in (whole, counted, [f"20249999_15595{second}_{second}" for second in range(4)]):
+    odd = [f"20249999_15595{second}_{second}" for second in range(4)]
+    for names, clock in ((whole, 1.0), (counted, 10.0), (odd, 10.0)):
         paths = [tmp_path / f"{name}.tif" for name in names]
         for path, image in zip(paths, scene(4), strict=True):
             write(path, image)
-        assert_allclose(read(paths)["exposure_time"], [0.0, 0.1, 0.2, 0.3])
+        assert_allclose(read(paths, clock=clock)["exposure_time"] * clock, range(4))
     write(paths[2], scene()[1])
     with pytest.warns(UserWarning, match=r"Same counts in '.*_1\.tif' and '.*_2\.tif', 1 in all"):
         read(paths)

@@ -128,8 +128,8 @@ def test_what_makes_no_capture(pair: tuple[xr.Dataset, xr.Dataset], name: str) -
         ("offset", np.nan, r"Invalid offset nan\. Must be a finite number"),
         ("offset", "0", r"Invalid offset '0'\. Must be a finite number"),
         ("offset", True, r"Invalid offset True\. Must be a finite number"),
-        ("bands", "ab", "Invalid bands 'ab'. Must be two different names"),
-        ("bands", ("a", "a"), r"Invalid bands \('a', 'a'\). Must be two different names"),
+        ("bands", "ab", "Invalid bands 'ab'. Must be 2 different names"),
+        ("bands", ("a", "a"), r"Invalid bands \('a', 'a'\). Must be 2 different names"),
         *(
             ("bands", one, "Invalid bands")
             for one in ((8.0, 9.5), ("a", "b", "c"), ("a", " "), None)
