@@ -4,6 +4,7 @@ See `dbthermal.__main__`.
 """
 
 import difflib
+import math
 import re
 import sys
 import threading
@@ -56,7 +57,8 @@ def accepted(function: Callable[..., Any], options: Namespace) -> dict[str, Any]
 
 def finite(text: str) -> float:
     """Finite number of a text."""
-    if not re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d\d?)?", text, re.IGNORECASE):
+    form = r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d\d?)?"
+    if not re.fullmatch(form, text, re.IGNORECASE) or math.isinf(float(text)):
         raise ArgumentTypeError(f"Invalid number '{text}'. Must be digits, with a decimal point.")
     return float(text)
 

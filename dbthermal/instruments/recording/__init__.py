@@ -252,12 +252,12 @@ def bench_series(
     series: dict[str, list[xr.Dataset]] = {material: [] for material in region}
     for paths in steps:
         background = _agreed(paths, BLACKBODY, stability)
-        captures = _bands(paths)
+        views = _views(paths)
         for material, place in region.items():
-            means = [_mean(captures[band], band, place, correction) for band in captures]
+            means = [_mean(view, place, correction) for view in views.values()]
             temperature = _agreed(paths, material, stability)
             values = {"object_temperature": temperature, "background_temperature": background}
-            measurement = xr.Dataset({"counts": ("band", means), **values}, {"band": [*captures]})
+            measurement = xr.Dataset({"counts": ("band", means), **values}, {"band": [*views]})
             series[material].append(measurement)
     # All steps of a material together.
     joined = {}
@@ -342,42 +342,39 @@ def _agreed(paths: list[Path], source: str, stability: float) -> float:
     return float(np.mean(means))
 
 
-def _bands(paths: list[Path]) -> dict[str, xr.Dataset]:
-    """Each band with the first recording that has it."""
-    captures: dict[str, xr.Dataset] = {}
+def _views(paths: list[Path]) -> dict[str, xr.Dataset]:
+    """Counts of each band, of the first recording that has it.
+
+    Of the frames that are whole, have a time, and show the view.
+    """
+    views: dict[str, xr.Dataset] = {}
     for path in paths:
         capture = open_capture(path).assign_attrs(path=str(path))
         for band in map(str, capture["band"].values):
-            captures.setdefault(band, capture)
-    return captures
-
-
-def _good_frames(capture: xr.Dataset, band: str) -> npt.NDArray[np.intp]:
-    """Positions in `time` of a band's frames that are whole, have a time, and show the view."""
-    good = _good(capture.sel(band=band), FrameFlag.SHUTTER_CLOSED, "exposure_time")
-    return np.flatnonzero(good)
+            good = _good(capture.sel(band=band), FrameFlag.SHUTTER_CLOSED, "exposure_time")
+            view = capture[["counts"]].sel(band=[band]).isel(time=np.flatnonzero(good))
+            views.setdefault(band, view)
+    return views
 
 
 def _movie(paths: list[Path], frames: int) -> xr.DataArray:
     """Counts (band, frame, y, x) of a step."""
     films = []
-    for band, capture in _bands(paths).items():
-        good = _good_frames(capture, band)
-        if good.size < frames:
-            text = f"with {good.size} good frames in band '{band}'. Must have {frames}"
-            raise ValueError(f"Invalid recording '{capture.attrs['path']}' {text}.")
-        # Read in one piece, up to the last frame that is needed.
-        counts = capture["counts"].sel(band=band).isel(time=slice(0, int(good[frames - 1]) + 1))
-        films.append(counts.load().isel(time=good[:frames]).drop_vars("time").rename(time="frame"))
+    for band, view in _views(paths).items():
+        if (number := view.sizes["time"]) < frames:
+            text = f"with {number} good frames in band '{band}'. Must have {frames}"
+            raise ValueError(f"Invalid recording '{view.attrs['path']}' {text}.")
+        counts = view["counts"].isel(time=slice(frames)).load()
+        films.append(counts.drop_vars("time").rename(time="frame"))
     return xr.concat(films, dim="band")
 
 
-def _mean(capture: xr.Dataset, band: str, region: Place, correction: xr.Dataset | None) -> float:
-    """Mean counts of a region in the good frames of a band."""
+def _mean(view: xr.Dataset, region: Place, correction: xr.Dataset | None) -> float:
+    """Mean counts of a region in a band."""
     place = {"y": region[0], "x": region[1]}
-    good = _good_frames(capture, band)
-    cropped = capture[["counts"]].sel(band=[band]).isel(time=good).isel(place)
-    counts, source = cropped["counts"], f"of band '{band}' in '{capture.attrs['path']}'"
+    cropped = view.isel(place)
+    counts = cropped["counts"]
+    source = f"of band '{view['band'].item()}' in '{view.attrs['path']}'"
     if counts.size == 0:
         raise ValueError(f"No frame or no pixel {source}. Must have one.")
     if correction is not None:

@@ -128,6 +128,12 @@ def record(
     after the start such a stamp counts as wrong. If the folder, or one above it, is renamed or
     moved on its disk, the recording goes on in it.
 
+    FileExistsError if `path` exists, ValueError if the sources are not those of the session, or
+    emulated and it is not, OSError if there is too little space, or the folder or one in it was
+    deleted or replaced. An error of a source, a reading or the preview, an interrupt by the
+    keyboard, and SIGTERM or SIGHUP in the main thread, as `SignalExit`, are raised when what was
+    recorded is kept; a second interrupt ends the wait, not the writing.
+
     Parameters
     ----------
     session, sources : Session, mapping
@@ -139,17 +145,6 @@ def record(
     limits, preview : optional
         `Limits`; and a function called now and then with a `Preview` in the caller's thread, which
         may take its time.
-
-    Raises
-    ------
-    FileExistsError, ValueError
-        If `path` exists; or the sources are not those of the session, or emulated and it is not.
-    OSError
-        If there is too little space, or the folder or one in it was deleted or replaced.
-    Exception, SignalExit
-        Error of a source, a reading or the preview, an interrupt by the keyboard, or SIGTERM or
-        SIGHUP in the main thread. In all cases what was recorded is kept; a second interrupt ends
-        the wait, not the writing.
     """
     limits, clock = limits or Limits(), _check(session, sources)
     with raised_signals(), clock.joined():
