@@ -30,6 +30,8 @@ from dbthermal.instruments.filterwheel import BSC10X, FilterWheel, Settings, Sta
 from dbthermal.instruments.tc08 import TC08
 from dbthermal.instruments.transport import EmulatedClock
 
+_ENDS = {Id.MOT_MOVE_COMPLETED, Id.MOT_MOVE_STOPPED, Id.MOT_MOVE_HOMED}  # of a motion
+
 
 @dataclass
 class WheelFaults:
@@ -130,7 +132,11 @@ class FaultyApt(EmulatedApt):
         return max(0.0, min([super().next_due(), *times]))
 
     def reply(self, identifier: Id, *arguments: Any, **options: Any) -> None:
-        """Send an answer, or lose it or add to it by a fault."""
+        """Send an answer or a report, or lose it, change its form or add to it by a fault."""
+        if identifier in _ENDS - {Id.MOT_MOVE_HOMED} and self.faults.long_reports:
+            arguments = (apt.pack(self.status()),)
+        elif identifier in _ENDS and self.faults.unreported:
+            return
         if self.faults.drop > 0:
             self.faults.drop -= 1
             return
@@ -139,13 +145,6 @@ class FaultyApt(EmulatedApt):
         if self.faults.stray_completed:
             super().reply(Id.MOT_MOVE_COMPLETED)
         super().reply(identifier, *arguments, **options)
-
-    def report(self, identifier: Id) -> None:
-        """Report the end of a motion, in another form or not at all by a fault."""
-        if self.faults.long_reports and identifier != Id.MOT_MOVE_HOMED:
-            self.reply(identifier, apt.pack(self.status()))
-        elif not self.faults.unreported:
-            super().report(identifier)
 
     def plan(self, drive: Drive) -> Drive:
         """Motion that is slower, shorter or endless by a fault."""
