@@ -169,13 +169,20 @@ class FaultyApt(EmulatedApt):
         return status._replace(bits=status.bits | sum(stuck))
 
 
-request, reply = fslp.encode, partial(fslp.encode, status=0)
-"""Bytes of a request to a Boson, and of its reply."""
+def request(
+    sequence: int, command: int, data: bytes = b"", status: int = fslp.REQUEST, channel: int = 0
+) -> bytes:
+    """Bytes of a request to a Boson."""
+    return fslp.encode(fslp.Frame(channel, sequence, command, status, data))
+
+
+reply = partial(request, status=0)
+"""Bytes of its reply."""
 
 
 def text(sequence: int, command: int) -> bytes:
     """Bytes of debug text that a Boson sends unasked, on a channel of its own."""
-    return fslp.encode(sequence, command, b"emulated debug text", 0, channel=0x99)
+    return request(sequence, command, b"emulated debug text", 0, channel=0x99)
 
 
 class FaultyBoson(EmulatedBoson):

@@ -18,7 +18,7 @@ import math
 import struct
 import threading
 from collections.abc import Callable, MutableSequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -149,7 +149,7 @@ class EmulatedBoson(Line):
                 (self.settings[command],) = struct.unpack(">i", data)
             else:
                 answer = readings[command]
-        return _fslp.encode(request.sequence, command, answer, status)
+        return _fslp.encode(replace(request, status=status, data=answer))
 
     def _readings(self) -> dict[int, bytes]:
         """Data of every reading and setting, by the identifier that reads it."""
