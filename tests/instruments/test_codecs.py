@@ -111,9 +111,8 @@ def test_frames_have_the_published_bytes() -> None:
         assert fslp.encode(frame) == bytes.fromhex(line)
         assert fslp.Decoder().feed(bytes.fromhex(line)) == [frame]
     assert fslp.checksum(b"123456789") == 0xE5CC
-    assert fslp.encode(Frame(0, 0, 0x0002001C, fslp.REQUEST))[-5:] == bytes.fromhex(
-        "FF 38 9E 91 AE"
-    )
+    request = Frame(0, 0, 0x0002001C, fslp.REQUEST)
+    assert fslp.encode(request)[-5:] == bytes.fromhex("FF 38 9E 91 AE")
     content = bytes.fromhex("00 000000 9E81 000000 9E91 9E81 9E91 9EA1 00 9EA1")
     sent = fslp.encode(Frame(0, 0x8E, 0x9E, 0x8E9EAE00, b"\xae"))
     assert sent[1 : 1 + len(content)] == content

@@ -73,18 +73,7 @@ def open_capture(path: str | Path, *, fitted: bool = False) -> xr.Dataset:
         for a frame that is damaged, missing or not new; `frame_flags` (band, time), with bit
         ``shutter_closed``; `device_time`, `host_time`, `sequence`, and the camera's telemetry, if
         any. `time` is when the first band was exposed [s]. If fitted, attribute ``clock_rates`` has
-        b of each band.
-
-    Examples
-    --------
-    >>> from dbthermal.instruments import devices, protocols, recording, session
-    >>> camera = session.Camera("v4l2:///dev/video0")
-    >>> plan = session.Session("pot", True, "scene", 0.2, {"8-14": camera}, shape=(24, 32))
-    >>> path, limits = getfixture("tmp_path") / "pot.zarr", recording.Limits(reserve=0)
-    >>> with devices.open_devices(plan) as rig:
-    ...     summary = protocols.record_scene(rig, path, limits=limits)
-    >>> recording.open_capture(path)["counts"].dims
-    ('band', 'time', 'y', 'x')
+        b of each band. See the example of `dbthermal.instruments.protocols.record_scene`.
     """
     recording = store.open_dataset(path)
     opened = recording.drop_dims("log", errors="ignore").drop_vars("time", errors="ignore")

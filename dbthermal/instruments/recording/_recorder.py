@@ -222,7 +222,7 @@ class _Run:
         self.over, self.done = threading.Event(), threading.Event()
         self.errors: list[BaseException] = []
         self.interrupted, self.ended = "", ""
-        # For the preview, after each frame is written: totals, last frames, last readings.
+        # For the preview: totals and last frames that are written, and last readings.
         self.totals: Totals = {}
         self.last_frames: dict[str, camera.Frame] = {}
         self.last_readings: dict[str, float] = {}
@@ -251,7 +251,7 @@ class _Run:
             self.over.set()
 
     def _put_note(self, kind: Note, source: str, value: float = math.nan) -> None:
-        self._work.put(partial(self._note, kind, source, self.clock(), value))
+        self._work.put(partial(self.file.note, kind, source, self.clock(), value))
 
     def _fetch(self, band: str, source: camera.FrameSource) -> None:
         """Queue the frames of a source for the writer, until the end.
@@ -286,6 +286,7 @@ class _Run:
                 except (OSError, RuntimeError, ValueError):
                     value, kind = math.nan, Note.READING_FAILED
                 self._put_note(kind, name, value)
+                self.last_readings[name] = value
             remaining = max(0.0, self.end - self.clock())
             self.clock.wait(self.over, min(self.limits.reading_period, remaining))
 
@@ -350,11 +351,6 @@ class _Run:
         self._written += 1
         if self._written % self.limits.chunk == 0 and self._is_going():
             _check_space(self.file.recording.root, self.limits.reserve)
-
-    def _note(self, kind: Note, source: str, time: float, value: float) -> None:
-        self.file.note(kind, source, time, value)
-        if kind in {Note.READING, Note.READING_FAILED}:
-            self.last_readings[source] = value
 
 
 def _check_space(path: Path, least: int) -> None:
