@@ -137,9 +137,7 @@ def _save(
     blocks: Iterable[xr.Dataset], path: str | Path, provenance: Any, *sizes: int | None
 ) -> None:
     """Save blocks of rows, of a height and width that chunks then divide."""
-    if not isinstance(provenance, Mapping):
-        kind = type(provenance).__name__
-        raise TypeError(f"Invalid provenance of type {kind}. Must be a mapping, see `provenance`.")
+    schema.require(provenance, Mapping, "provenance")
     first, attrs = xr.Dataset(), {"provenance": json.loads(as_json(provenance))}
     with whole(path, ".zarr") as folder:
         folder.mkdir()

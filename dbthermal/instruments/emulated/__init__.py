@@ -24,6 +24,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from dbthermal import _text as texts
 from dbthermal import response as responses
 from dbthermal import simulation
 from dbthermal.bands import FILTERS
@@ -125,9 +126,8 @@ class World:
         if place == "open":
             return math.nan
         temperatures = self.scene_temperatures()
-        if place not in temperatures:
-            rule = f"Must be one of {sorted(temperatures)}"
-            raise KeyError(f"Unknown place '{place}' of thermocouple {channel}. {rule}.")
+        label = f"Unknown place of thermocouple {channel}"
+        texts.check_listed(label, place, sorted(temperatures), KeyError)
         return temperatures[place]
 
     def add_camera(self, name: str, serial_number: int) -> CameraState:
@@ -140,8 +140,7 @@ class World:
 
     def camera(self, name: str) -> CameraState:
         """State of a camera, shared by all emulators; KeyError if none has this name."""
-        if name not in self.cameras:
-            raise KeyError(f"Unknown camera '{name}'. Must be one of {sorted(self.cameras)}.")
+        texts.check_listed("Unknown camera", name, sorted(self.cameras), KeyError)
         return self.cameras[name]
 
     def furnish(self, session: Session) -> None:
@@ -194,9 +193,7 @@ class EmulatedCamera(Closing):
     is_simulated: bool = field(default=True, init=False)
 
     def __post_init__(self) -> None:
-        if self.kind not in MODELS:
-            rule = f"Must be one of {sorted(MODELS)}"
-            raise ValueError(f"Unknown emulated camera '{self.kind}'. {rule}.")
+        texts.check_listed("Unknown emulated camera", self.kind, sorted(MODELS))
         self.clock, self._state = self.world.clock, self.world.camera(self.name)
         self._state.has_frames = True
         self.identity: Mapping[str, str] = {
@@ -267,8 +264,7 @@ class EmulatedCamera(Closing):
         band = self.band or self.world.filter_name
         if band is None:
             return np.full(self.shape, CLOSED, dtype=np.uint16)
-        if band not in self.pictures:
-            raise KeyError(f"Unknown band '{band}'. Must be one of {sorted(self.pictures)}.")
+        texts.check_listed("Unknown band", band, sorted(self.pictures), KeyError)
         image = self.pictures[band](self.world.scene_time(time))
         if image.shape != self.shape or image.dtype != np.uint16:
             label = f"Invalid picture {image.shape} of {image.dtype} in band '{band}'"
