@@ -67,37 +67,26 @@ class CameraState:
     last_ffc_temperature: float = FPA  # fpa_temperature at its start [K]
 
 
+@dataclass(kw_only=True, eq=False)
 class World:
-    """An emulated bench: wheel, blackbody, scene and cameras, on one `clock` [s].
+    """An emulated bench: wheel, blackbody, scene and cameras, on one clock.
 
-    Its clock is an `EmulatedClock`, or `dbthermal.instruments.transport.SYSTEM` for real time.
-    `filters` has the band in each slot of the wheel, 1 to 6, and `wheel_position` is the slot in
-    the beam, None while the wheel turns or is between two slots. `scene` has temperatures [K] by
-    name at a time of the scene [s]; if it `waits` it stands at its beginning until `begin`.
-    `thermocouples` has the place of each channel, 1 to 8: a name in the scene, ``"blackbody"``,
-    ``"room"`` or ``"open"``. Single attributes may be read and set from any thread; to change
-    several together, hold `lock`.
+    Single attributes may be read and set from any thread; to change several together, hold `lock`.
     """
 
-    def __init__(
-        self,
-        *,
-        clock: Clock | None = None,
-        filters: Mapping[int, str] | None = None,
-        wheel_position: int = 1,
-        blackbody_temperature: float = ROOM,
-        scene: Callable[[float], Mapping[str, float]] | None = None,
-        waits: bool = False,
-    ) -> None:
-        self.lock = threading.RLock()
-        self.clock = clock or EmulatedClock()
-        self.filters = dict(filters or {})
-        self.thermocouples: dict[int, str] = {}
-        self.cameras: dict[str, CameraState] = {}
-        self.blackbody_temperature = blackbody_temperature
-        self.scene_began = math.inf if waits else self.clock()
-        self._scene = scene
-        self.wheel_position: int | None = wheel_position
+    clock: Clock = field(default_factory=EmulatedClock)  # or `SYSTEM`, for real time [s]
+    filters: Mapping[int, str] = field(default_factory=dict)  # band in each slot, 1 to 6
+    wheel_position: int | None = 1  # slot in the beam; None while it turns, or is between two slots
+    blackbody_temperature: float = ROOM  # [K]
+    # Temperatures [K] by name at a time of the scene [s]; if it waits, it stands until `begin`.
+    scene: Callable[[float], Mapping[str, float]] = lambda _: {}
+    waits: bool = False
+    # Place of each channel, 1 to 8: a name in the scene, "blackbody", "room" or "open".
+    thermocouples: dict[int, str] = field(default_factory=dict)
+    cameras: dict[str, CameraState] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.lock, self.scene_began = threading.RLock(), math.inf if self.waits else self.clock()
 
     def begin(self) -> None:
         """Let the scene begin now, or anew."""
@@ -114,7 +103,7 @@ class World:
 
     def scene_temperatures(self) -> dict[str, float]:
         """Temperatures [K] in the scene by name, with ``"blackbody"`` and ``"room"``."""
-        scene = {} if self._scene is None else self._scene(self.scene_time())
+        scene = self.scene(self.scene_time())
         return {"room": ROOM, **scene, "blackbody": self.blackbody_temperature}
 
     def thermocouple_temperature(self, channel: int) -> float:
