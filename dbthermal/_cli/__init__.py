@@ -128,7 +128,7 @@ def lines_of(summary: Any, indent: str = "") -> Iterator[str]:
             yield f"{indent}{key}:"
             yield from lines_of(value, indent + "  ")
             continue
-        words = [f"{name} {number:g}" for name, number in entries.items()]
+        words = [f"{name} {it if it is None else f'{it:g}'}" for name, it in entries.items()]
         if line := ", ".join(words if isinstance(value, dict) else map(str, leaves(value))):
             yield f"{indent}{key}: {line}"
 

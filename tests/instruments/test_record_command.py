@@ -71,6 +71,15 @@ def test_scene_of_a_simulated_blackbody(tmp_path: Path) -> None:
     assert float(capture["counts"].std("x").mean()) > 1
 
 
+def test_a_recording_is_described(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`info` takes a recording, whose session leaves settings of its devices open."""
+    assert run(tmp_path, scene_text()) == 0
+    assert main(["info", str(tmp_path / "recorded" / "plate.zarr")]) == 0
+    said = capsys.readouterr().out
+    assert "stage: capture" in said
+    assert "wheel: serial_number None, home_offset " in said
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
