@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from rig_session import LEVELS, TEXT, from_yaml, replaced, rig, scene_text
 
+from dbthermal import store
 from dbthermal.__main__ import main
+from dbthermal._cli import files
 from dbthermal._cli import record as command
 from dbthermal.instruments import inventory, protocols, recording
 from dbthermal.instruments.devices import Devices, open_devices
@@ -78,6 +80,17 @@ def test_a_recording_is_described(tmp_path: Path, capsys: pytest.CaptureFixture[
     said = capsys.readouterr().out
     assert "stage: capture" in said
     assert "wheel: serial_number None, home_offset " in said
+
+
+def test_what_is_made_of_a_recording_is_none(tmp_path: Path) -> None:
+    """A capture without exposure times, as an aligned one, keeps its clock, and is not listed."""
+    assert run(tmp_path, scene_text()) == 0
+    capture = open_capture((folder := tmp_path / "recorded") / "plate.zarr")
+    aligned = capture.isel(time=slice(2, None)).drop_vars("exposure_time")
+    store.save(aligned, folder / "aligned.zarr", store.provenance({}))
+    opened = files.opened(folder / "aligned.zarr")
+    np.testing.assert_array_equal(opened["time"], aligned["time"])
+    assert {*recording.overview(folder)["recording"].values} == {"plate"}
 
 
 @pytest.mark.parametrize(

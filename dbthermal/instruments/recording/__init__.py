@@ -140,7 +140,8 @@ def overview(folder: str | Path) -> xr.Dataset:
     rows = []
     for path in sorted(Path(folder).glob("*.zarr")):
         attrs = (recording := store.open_dataset(path)).attrs
-        for band, number in attrs.get("frames_written", {}).items():
+        is_recording = "log_time" in recording  # what is made of it has its attributes, and no log
+        for band, number in attrs["frames_written"].items() if is_recording else ():
             frames = recording.sel(band=band).isel(time=slice(0, number))
             steps = np.diff(frames["device_time"].values[_good(frames, UNTIMED)])
             session = attrs["provenance"]["parameters"]
