@@ -18,7 +18,7 @@ BUDGET = {
     "emissivity": (448, 3),
     "explorer": (1295, 6),
     "figures": (608, 4),
-    "instruments": (5523, 20),
+    "instruments": (5525, 20),
     "limits": (732, 4),
     "readers": (2691, 12),
     "reporting": (404, 2),
@@ -26,7 +26,7 @@ BUDGET = {
     "simulation": (570, 3),
     "store": (1411, 6),
 }
-INSTALLED = 36_761  # lines of all rooms
+INSTALLED = 36_763  # lines of all rooms
 
 PRONOUNS = {
     *("one", "other", "others", "own", "part", "parts", "some", "here", "there", "told", "known"),

@@ -91,6 +91,8 @@ def test_what_is_made_of_a_recording_is_none(tmp_path: Path) -> None:
     opened = files.opened(folder / "aligned.zarr")
     np.testing.assert_array_equal(opened["time"], aligned["time"])
     assert {*recording.overview(folder)["recording"].values} == {"plate"}
+    with pytest.raises(ValueError, match=r"No recording .*aligned\.zarr'\. Must be"):
+        open_capture(folder / "aligned.zarr")
 
 
 @pytest.mark.parametrize(

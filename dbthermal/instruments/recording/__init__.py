@@ -54,8 +54,8 @@ _WHOLE: Final = 0.95  # share of the promised frames with which a recording is w
 def open_capture(path: str | Path, *, fitted: bool = False) -> xr.Dataset:
     """Open a recording as stage `capture`, also one that was cut short or is being written.
 
-    FileNotFoundError or ValueError if the folder does not exist, a band has fewer than two frames
-    with a time, or as `dbthermal.store.open_dataset`.
+    FileNotFoundError or ValueError if the folder does not exist or is no recording, a band has
+    fewer than two frames with a time, or as `dbthermal.store.open_dataset`.
 
     Parameters
     ----------
@@ -76,7 +76,9 @@ def open_capture(path: str | Path, *, fitted: bool = False) -> xr.Dataset:
         b of each band. See the example of `dbthermal.instruments.protocols.record_scene`.
     """
     recording = store.open_dataset(path)
-    opened = recording.drop_dims("log", errors="ignore").drop_vars("time", errors="ignore")
+    if "log_time" not in recording:  # its frames would count as a second apart
+        raise ValueError(f"No recording '{path}'. Must be, or be opened by store.open_dataset.")
+    opened = recording.drop_dims("log").drop_vars("time", errors="ignore")
     opened = _fitted(opened) if fitted else opened
     # Exposure times are checked against a coordinate, which is made of them.
     numbered = opened.assign_coords(time=np.arange(opened.sizes["time"], dtype=np.float64))
