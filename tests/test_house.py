@@ -24,9 +24,9 @@ BUDGET = {
     "reporting": (404, 2),
     "separation": (12928, 54),
     "simulation": (570, 3),
-    "store": (1411, 6),
+    "store": (1410, 6),
 }
-INSTALLED = 36_763  # lines of all rooms
+INSTALLED = 36_762  # lines of all rooms
 
 PRONOUNS = {
     *("one", "other", "others", "own", "part", "parts", "some", "here", "there", "told", "known"),
