@@ -119,6 +119,12 @@ def repeated(values: Iterable[Any]) -> list[Any]:
     return [value for value, count in Counter(values).items() if count > 1]
 
 
+def check_listed(label: str, value: Any, listed: Iterable[Any], error: Any = ValueError) -> None:
+    """Raise an error for a value that is not among those of a list, with these."""
+    if value not in (allowed := [*listed]):
+        raise error(f"{label} {shown(value)}. Must be one of {allowed}.")
+
+
 def number(text: str, place: str) -> float:
     """Finite number written in decimal digits; ValueError with its `place` if it is not one."""
     text = text.strip(" \t")

@@ -560,6 +560,7 @@ export result.zarr --variable noise -o x.tif -> 'noise' for .tif. Must be one of
 separate aligned.zarr response.zarr --method calibrated --emissivity 1 -o x.zarr
  -> Must be one for each
 separate aligned.zarr response.zarr --offset nan -o x.zarr -> --offset: Invalid number 'nan'
+plan --noise {"9" * 400} -> argument --noise: Invalid number '999
 plan --noise 30mK -> argument --noise: Invalid number '30mK'. Must be digits
 plan --noise -0.03 -> Invalid noise .K. -0.03. Must be finite and positive
 plan --noise 30 -> Invalid noise 30 K. Must be below 5 K: 30 mK are 0.03 K

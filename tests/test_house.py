@@ -10,23 +10,23 @@ HOUSE = Path(dbthermal.__file__).parent
 
 # Lines and modules that a room may have. A room that grows takes from another; these only fall.
 BUDGET = {
-    "": (3485, 18),
-    "_cli": (1226, 5),
+    "": (3491, 18),
+    "_cli": (1224, 5),
     "alignment": (2883, 13),
     "calibration": (799, 3),
-    "correction": (1766, 7),
+    "correction": (1754, 7),
     "emissivity": (448, 3),
     "explorer": (1295, 6),
     "figures": (608, 4),
-    "instruments": (5574, 20),
+    "instruments": (5525, 20),
     "limits": (732, 4),
-    "readers": (2701, 12),
+    "readers": (2691, 12),
     "reporting": (404, 2),
     "separation": (12928, 54),
     "simulation": (570, 3),
-    "store": (1427, 6),
+    "store": (1410, 6),
 }
-INSTALLED = 36_846  # lines of all rooms
+INSTALLED = 36_762  # lines of all rooms
 
 PRONOUNS = {
     *("one", "other", "others", "own", "part", "parts", "some", "here", "there", "told", "known"),

@@ -4,6 +4,7 @@ See `dbthermal.__main__`.
 """
 
 import difflib
+import math
 import re
 import sys
 import threading
@@ -56,7 +57,8 @@ def accepted(function: Callable[..., Any], options: Namespace) -> dict[str, Any]
 
 def finite(text: str) -> float:
     """Finite number of a text."""
-    if not re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d\d?)?", text, re.IGNORECASE):
+    form = r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d\d?)?"
+    if not re.fullmatch(form, text, re.IGNORECASE) or math.isinf(float(text)):
         raise ArgumentTypeError(f"Invalid number '{text}'. Must be digits, with a decimal point.")
     return float(text)
 
@@ -126,7 +128,7 @@ def lines_of(summary: Any, indent: str = "") -> Iterator[str]:
             yield f"{indent}{key}:"
             yield from lines_of(value, indent + "  ")
             continue
-        words = [f"{name} {number:g}" for name, number in entries.items()]
+        words = [f"{name} {it if it is None else f'{it:g}'}" for name, it in entries.items()]
         if line := ", ".join(words if isinstance(value, dict) else map(str, leaves(value))):
             yield f"{indent}{key}: {line}"
 

@@ -48,7 +48,7 @@ _NOT_RECORDED: Final = {"dry_run", "json", "overwrite", "place", "traceback"}
 def opened(path: Path) -> xr.Dataset:
     """Dataset of a store, or stage `capture` of a recording."""
     dataset = store.open_dataset(path)
-    if "frames_written" not in dataset.attrs:
+    if "log_time" not in dataset:  # what is made of a recording has its attributes, and no log
         return dataset
     from dbthermal.instruments import recording  # noqa: PLC0415 - optional
 

@@ -73,11 +73,7 @@ def _run(session: Session, folder: Path, *, dry: bool) -> int:
 
 def _record(devices: Devices, folder: Path) -> list[Summary]:
     """Run the session's protocol."""
-    watch, name = Watch(), devices.session.name
-
-    def show(preview: Preview) -> None:
-        _say(_progress(watch, preview), end="")
-
+    show, name = partial(_progress, Watch()), devices.session.name
     if devices.session.blackbody is None:
         summaries = [protocols.record_scene(devices, folder / f"{name}.zarr", preview=show)]
     else:
@@ -87,14 +83,14 @@ def _record(devices: Devices, folder: Path) -> list[Summary]:
     return summaries
 
 
-def _progress(watch: Watch, preview: Preview) -> str:
-    """Progress of a recording in a line that is written over the line before."""
+def _progress(watch: Watch, preview: Preview) -> None:
+    """Print the progress of a recording in a line that is written over the line before."""
     watch.note(preview)
     bands = "; ".join(
         f"{band}: " + ", ".join([*status.text.splitlines(), *status.warning.splitlines()])
         for band, status in watch.status().items()
     )
-    return f"\r{preview.time:6.1f} s  {bands}"
+    _say(f"\r{preview.time:6.1f} s  {bands}", end="")
 
 
 def _set_blackbody(devices: Devices, temperature: float) -> None:

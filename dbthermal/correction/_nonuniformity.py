@@ -194,7 +194,7 @@ def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
         Mean of raw frames of a uniform view, (band, y, x) [count], such as a lens cap or the
         camera's shutter, of the bands of the correction.
     """
-    _require_rising(_checked(correction))
+    _require_usable(correction)
     schema.check_numbers(flat, "the flat image", "count")
     if flat.dims != ("band", "y", "x") or "band" not in flat.coords:
         rule = "Must be (band, y, x), bands by name"
@@ -248,8 +248,8 @@ def correct(
     if (counts.dtype.kind, counts.dtype.itemsize) != ("u", 2):  # of either byte order
         raise TypeError(f"Invalid dtype {counts.dtype} of the capture's counts. Must be uint16.")
     _numbers.whole_number("maximum of the detector", maximum, (1, DETECTOR_MAXIMUM))
-    maps = laid_on(_checked(correction), counts, "the correction", "the capture")
-    maps = _require_rising(maps[["gain", "offset", "bad"]])
+    maps = laid_on(correction, counts, "the correction", "the capture")
+    _require_usable(maps)
     corrected = np.empty(counts.shape, dtype=np.float32)
     saturated = np.zeros(counts.shape[2:], dtype=bool)
     for band in range(len(counts)):
@@ -364,17 +364,13 @@ def outlying(values: Array, good: Mask, threshold: float) -> Mask:
     return np.asarray(np.abs(values - centre) > threshold * max(scale, _ROUNDING))
 
 
-def _checked(correction: xr.Dataset) -> xr.Dataset:
-    """Return a correction; ValueError if it does not mark its bad pixels."""
-    if "bad" not in schema.check(correction, "correction"):
+def _require_usable(correction: xr.Dataset) -> None:
+    """Refuse gains and offsets without bad pixels, not finite, or, of good pixels, not positive."""
+    schema.check(correction, "correction")
+    if "bad" not in correction:
         raise ValueError("Missing 'bad' (band, y, x) in the correction. Must mark its bad pixels.")
-    return correction
-
-
-def _require_rising(maps: xr.Dataset) -> xr.Dataset:
-    """Refuse gains and offsets that are not finite, and gains of good pixels not positive."""
-    for name, holds in {"gain": (maps["gain"] > 0) | maps["bad"], "offset": True}.items():
-        if not np.all(schema.measured(maps[name]) & holds):
+    positive = (correction["gain"] > 0) | correction["bad"]
+    for name, holds in {"gain": positive, "offset": True}.items():
+        if not np.all(schema.measured(correction[name]) & holds):
             label = f"Invalid {name} of the correction: not finite, or not positive"
             raise ValueError(f"{label}. Must be finite, and a gain positive.")
-    return maps.drop_vars(["y", "x"], errors="ignore")

@@ -11,7 +11,7 @@ import xarray as xr
 from scipy.ndimage import maximum_filter1d, median_filter
 
 from dbthermal import _numbers, _rows, _samples, schema
-from dbthermal._arrays import Array, Mask
+from dbthermal._arrays import Array, Mask, quotient
 from dbthermal._warnings import warned
 from dbthermal.correction._nonuniformity import OUTLIER, outlying
 from dbthermal.noise import MAD, MINIMUM_FRAMES
@@ -154,9 +154,9 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
 
 def _mean(block: Single) -> Array:
     """Mean picture (y, x) of frames (time, y, x); NaN of pixels without a sample."""
-    number = np.isfinite(block).sum(axis=0)
-    total = block.sum(axis=0, dtype=np.float64, where=np.isfinite(block))
-    return np.asarray(np.divide(total, number, out=total * np.nan, where=number > 0))
+    finite = np.isfinite(block)
+    total = block.sum(axis=0, dtype=np.float64, where=finite)
+    return np.asarray(quotient(total, finite.sum(axis=0), np.nan))
 
 
 def _pattern(image: Array) -> float:

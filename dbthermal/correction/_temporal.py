@@ -48,31 +48,23 @@ def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.D
         raise ValueError("Invalid dataset: the lag was undone before. Must be as the pixels lag.")
     if counts.sizes["time"] < 2:
         raise ValueError("Invalid capture of 1 frame. Must have at least 2, for a lag.")
-    old, new = lag_coefficients(time_constant, counts)
+    constants = time_constants(time_constant, counts)
+    ratio = np.diff(counts["time"].values.astype(np.float64)) / constants[:, np.newaxis]
+    # z_n = I_n + (I_n - I_n-1) a / (1 - a): a correction that is small where the lag is.
+    gain = np.exp(-ratio) / -np.expm1(-ratio)
     signal = np.full_like(counts.values, np.nan)
     for band in range(counts.sizes["band"]):
         movie = counts.isel(band=band).values
         movie = np.where(schema.measured(movie), movie, np.nan)
         for frame in range(1, len(movie)):
-            # z_n = I_n + (I_n - I_n-1) a / (1 - a): a correction that is small where the lag is.
-            gain = old[band, frame - 1] / new[band, frame - 1]
-            signal[band, frame] = movie[frame] + (movie[frame] - movie[frame - 1]) * gain
-    constants = _time_constants(time_constant, counts)
-    ratio = np.median(np.diff(counts["time"].values.astype(np.float64))) / constants
+            change = movie[frame] - movie[frame - 1]
+            signal[band, frame] = movie[frame] + change * gain[band, frame - 1]
     # z = (I_n - a I_n-1) / (1 - a), of independent noises: sqrt(1 + a^2) / (1 - a).
+    ratio = np.median(ratio, axis=1)
     amplification = np.hypot(1.0, np.exp(-ratio)) / -np.expm1(-ratio)
     return corrected.assign(counts=(counts.dims, signal, counts.attrs)).assign_attrs(
         lag_time_constant=constants.tolist(), lag_noise_amplification=amplification.tolist()
     )
-
-
-def lag_coefficients(
-    time_constant: float | xr.DataArray, counts: xr.DataArray
-) -> tuple[Array, Array]:
-    """Weights (band, time - 1): a = exp(-dt / tau) of the frame before, 1 - a of the signal."""
-    interval = np.diff(counts["time"].values.astype(np.float64))
-    ratio = interval / _time_constants(time_constant, counts)[:, np.newaxis]
-    return np.exp(-ratio), -np.expm1(-ratio)
 
 
 def undo_drift(
@@ -146,7 +138,7 @@ def undo_drift(
     )
 
 
-def _time_constants(time_constant: float | xr.DataArray, counts: xr.DataArray) -> Array:
+def time_constants(time_constant: float | xr.DataArray, counts: xr.DataArray) -> Array:
     """Time constant of each band [s]."""
     names, name = [str(name) for name in counts["band"].values], "time_constant [s]"
     if isinstance(time_constant, xr.DataArray):

@@ -11,11 +11,12 @@ LJMUAstroecology/flirpy issue 21.
 """
 
 import binascii
-import operator
 import re
 import struct
 from dataclasses import dataclass
 from typing import Final
+
+from dbthermal import _numbers
 
 COMMAND_CHANNEL: Final = 0x00  # of commands and replies; frames of all others are ignored
 REQUEST: Final = 0xFFFFFFFF  # status of a request; that of a reply is 0 or an error code
@@ -46,26 +47,18 @@ def checksum(content: bytes) -> int:
     return binascii.crc_hqx(content, 0x1D0F)
 
 
-def encode(
-    sequence: int,
-    command: int,
-    data: bytes = b"",
-    status: int = REQUEST,
-    *,
-    channel: int = COMMAND_CHANNEL,
-) -> bytes:
+def encode(frame: Frame) -> bytes:
     """Bytes of a frame; header, data and checksum are all escaped.
 
     TypeError or ValueError if a number does not fit its field, or the data are too long.
     """
-    numbers = {"channel": channel, "sequence number": sequence, "command": command}
-    for name, value in {**numbers, "status": status}.items():
-        largest = 0xFF if name == "channel" else 0xFFFFFFFF
-        if not 0 <= operator.index(value) <= largest:
-            raise ValueError(f"Invalid {name} {value}. Must lie in 0 to {largest}.")
-    if len(data) > MAXIMUM_DATA:
-        raise ValueError(f"Invalid data of {len(data)} bytes. Must be at most {MAXIMUM_DATA}.")
-    content = _HEADER.pack(channel, sequence, command, status) + data
+    numbers = {"channel": frame.channel, "sequence number": frame.sequence}
+    numbers |= {"command": frame.command, "status": frame.status}
+    for name, value in numbers.items():
+        _numbers.whole_number(name, value, (0, 0xFF if name == "channel" else 0xFFFFFFFF))
+    if (size := len(frame.data)) > MAXIMUM_DATA:
+        raise ValueError(f"Invalid data of {size} bytes. Must be at most {MAXIMUM_DATA}.")
+    content = _HEADER.pack(*numbers.values()) + frame.data
     content += _CHECKSUM.pack(checksum(content))
     pieces = (_ESCAPE + bytes((v - _SHIFT,)) if v in _SPECIAL else bytes((v,)) for v in content)
     return _START + b"".join(pieces) + _END

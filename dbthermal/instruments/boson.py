@@ -281,7 +281,9 @@ class Boson(Closing):
         for _ in range(repeats + 1):
             with self._clock.hold(self._lock):
                 self._sequence = _fslp.next_sequence(self._sequence)
-                self._transport.write(_fslp.encode(self._sequence, command, data))
+                number, status = self._sequence, _fslp.REQUEST
+                request = _fslp.Frame(_fslp.COMMAND_CHANNEL, number, command, status, data)
+                self._transport.write(_fslp.encode(request))
                 if reply := self._reply(name):
                     break
         else:

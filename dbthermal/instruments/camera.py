@@ -197,9 +197,7 @@ class CameraKind:
 
 def camera_kind(name: str) -> CameraKind:
     """Import the kind of camera of this name; ValueError if it is not one of `KINDS`."""
-    if name not in KINDS:
-        rule = f"Must be one of {sorted(KINDS)}"
-        raise ValueError(f"Unknown kind of camera {texts.shown(name)}. {rule}.")
+    texts.check_listed("Unknown kind of camera", name, sorted(KINDS))
     kind: CameraKind = importlib.import_module(KINDS[name]).KIND
     return kind
 

@@ -184,6 +184,8 @@ def record_scene(
     ...     summary = record_scene(devices, folder / "demo.zarr", limits=small)
     >>> summary.ended, summary.totals["8-14"]["lost"]
     ('duration', 0)
+    >>> recording.open_capture(summary.path)["counts"].dims
+    ('band', 'time', 'y', 'x')
     """
     expected = devices.session.filtered
     if devices.wheel is not None and devices.wheel.band() != expected:

@@ -196,7 +196,8 @@ class Session:
         rows, columns = self.telemetry_rows, self.shape[1]
         for band, camera in self.cameras.items():
             allowed = camera_kind(camera.kind).telemetry_rows
-            _check_one_of(f"telemetry_rows of band '{band}', a {camera.kind},", rows, allowed)
+            label = f"Invalid telemetry_rows of band '{band}', a {camera.kind},"
+            texts.check_listed(label, rows, allowed)
         if rows and rows * columns < telemetry.WORDS:
             rule = f"Must have {telemetry.WORDS // rows} columns for the telemetry"
             raise ValueError(f"Invalid shape {list(self.shape)}. {rule}")
@@ -221,7 +222,7 @@ class Session:
         if self.filters and len(behind) != 1:
             raise ValueError(f"Invalid cameras {behind} behind the wheel. Must be exactly one")
         for band in self.sweep:
-            _check_one_of("filter of the sweep", band, self.filters.values())
+            texts.check_listed("Invalid filter of the sweep", band, self.filters.values())
         _check_unique("filter of the sweep", self.sweep)
         if self.sweep and self.blackbody is None:
             raise ValueError(f"Invalid sweep {list(self.sweep)}. Must have a blackbody")
@@ -287,11 +288,6 @@ class Session:
                 messages.append(f"{files.get(key, path)}: {_message(details)}")
             raise ValueError("\n".join(messages)) from None
         return session
-
-
-def _check_one_of(name: str, value: Any, allowed: Iterable[Any]) -> None:
-    if value not in (allowed := list(allowed)):
-        raise ValueError(f"Invalid {name} {value!r}. Must be one of {allowed}")
 
 
 def _check_unique(name: str, values: Iterable[Any]) -> None:

@@ -219,7 +219,7 @@ class TC08(Closing):
         for channel in channels:
             if channel not in range(1, CHANNELS):
                 raise ValueError(f"Invalid channel {channel}. Must lie in 1 to {CHANNELS - 1}.")
-        self.channels = {}  # until all are set
+        self.channels, self._scan = {}, None  # until all are set; an older scan is not of these
         # The cold junction, and a type or off for each socket.
         for channel in range(CHANNELS):
             letter = (KIND if channel in channels else " ") if channel else "C"

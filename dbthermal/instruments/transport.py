@@ -330,12 +330,12 @@ class SerialTransport(Closing):
 
     def write(self, data: bytes) -> None:
         """Send all bytes; `TransportError` if the device takes none for `WRITE_TIMEOUT`."""
-        with self.named("write to"):
+        with _named("write to", self.url):
             self._port.write(data)
 
     def read(self, size: int, timeout: float) -> bytes:
         """Wait for bytes, at most `timeout` [s]; see `Transport.read`."""
-        with self.named("read from"):
+        with _named("read from", self.url):
             self._port.timeout = timeout
             first: bytes = self._port.read(1)
             waiting = min(size - 1, self._port.in_waiting) if first else 0
@@ -343,17 +343,17 @@ class SerialTransport(Closing):
 
     def close(self) -> None:
         """Release the port."""
-        with self.named("close"):
+        with _named("close", self.url):
             self._port.close()
 
-    @contextmanager
-    def named(self, action: str) -> Iterator[None]:
-        """Name port and action in the errors of pyserial, which are OSError."""
-        try:
-            yield
-        except OSError as error:
-            rule = "The device must stay connected"
-            raise TransportError(f"Could not {action} '{self.url}': {error}. {rule}.") from error
+
+@contextmanager
+def _named(action: str, port: str, rule: str = "The device must stay connected") -> Iterator[None]:
+    """Name port and action in the errors of pyserial, which are OSError."""
+    try:
+        yield
+    except OSError as error:
+        raise TransportError(f"Could not {action} '{port}': {error}. {rule}.") from error
 
 
 def open_serial(url: str, *, baudrate: int, rtscts: bool = False) -> SerialTransport:
@@ -370,15 +370,12 @@ def open_serial(url: str, *, baudrate: int, rtscts: bool = False) -> SerialTrans
     import serial  # noqa: PLC0415 - an optional package, which cameras without a port do without
 
     options = {"rtscts": rtscts, "exclusive": True, "write_timeout": WRITE_TIMEOUT}
-    try:
+    with _named("open", path, "It must exist, be yours to use, and in no other program's use"):
         port = serial.Serial(path, baudrate, **options)
-    except OSError as error:
-        rule = "It must exist, be yours to use, and in no other program's use"
-        raise TransportError(f"Could not open '{path}': {error}. {rule}.") from error
     with ExitStack() as stack:
         line = stack.enter_context(SerialTransport(port, url))
         if rtscts:
-            with line.named("set RTS of"):
+            with _named("set RTS of", url):
                 port.rts = False
                 line.clock.sleep(SETTLING)
                 port.rts = True

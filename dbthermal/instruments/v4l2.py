@@ -131,7 +131,9 @@ class Capture(Closing):
             try:
                 buffer = self._ask(DQBUF, BUFFER, *_buffer(0))
             except BlockingIOError:
-                continue  # announced, and missing
+                if self.clock() < deadline:
+                    continue  # announced, and missing
+                break
             except OSError as error:
                 if error.errno not in _GONE:
                     raise

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from dbthermal import schema
+from dbthermal import _numbers, schema
 from dbthermal.readers import _containers, _formats, _recording
 from dbthermal.readers._recording import MEMORY, Clock
 
@@ -64,7 +64,7 @@ def array(
     is_file = isinstance(source, str | Path)
     label = Path(source).name if isinstance(source, str | Path) else "array"
     _recording.check_unit(unit, label)
-    _recording.check_number(memory, "memory")
+    _numbers.real_number("memory", memory, _numbers.POSITIVE)
     (path,) = _formats.files([source], "array") if isinstance(source, str | Path) else (Path(),)
     inside = path.rglob("*") if path.is_dir() else [path]
     stored = sum(file.lstat().st_size for file in inside) if is_file else np.inf

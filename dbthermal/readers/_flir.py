@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from dbthermal import _numbers
 from dbthermal import _text as texts
 from dbthermal._arrays import Array, Mask, empty, release
 from dbthermal._warnings import warned
@@ -124,7 +125,7 @@ def flir(
     """  # noqa: E501
     paths = _formats.files(path, "flir")
     name = _recording.label(paths)
-    _recording.check_number(memory, "memory")
+    _numbers.real_number("memory", memory, _numbers.POSITIVE)
     wanted = slice(None) if frames is None else frames
     stated = "" if byte_order is None else _recording.byte_order(name, byte_order)
     # Records of the selected frames.

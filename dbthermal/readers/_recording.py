@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from dbthermal import _text, schema
+from dbthermal import _numbers, _text, schema
 from dbthermal._arrays import Array, empty, made_on_disk, parts
 from dbthermal._warnings import warned
 from dbthermal.readers._formats import PNG
@@ -120,16 +120,6 @@ def damage_named(label: str, rule: str) -> Iterator[None]:
         raise ValueError(f"{label}: {message}") from error
 
 
-def check_number(value: Any, name: str, *, whole: bool = False) -> None:
-    """Raise TypeError or ValueError for an argument that is not one finite, or whole, number."""
-    rule = f"Must be a {'whole' if whole else 'finite'} number"
-    array = np.asarray(value)
-    if array.ndim or array.dtype.kind not in ("iu" if whole else "iuf"):
-        raise TypeError(f"Invalid {name} {_text.shown(value)}. {rule}.")
-    if not np.isfinite(array):
-        raise ValueError(f"Invalid {name} {value}. {rule}.")
-
-
 def check_present(counts: Counts, fills: Sequence[Any], name: str) -> None:
     """Raise ValueError where counts are values that stand for missing ones."""
     if fills and any(np.isin(counts[at], fills).any() for at in parts(counts)):
@@ -138,7 +128,7 @@ def check_present(counts: Counts, fills: Sequence[Any], name: str) -> None:
 
 def check_memory(shape: Sequence[int], memory: float, name: str, stored: float = np.inf) -> None:
     """Raise ValueError if counts (time, y, x) take more memory than allowed, or the file holds."""
-    check_number(memory, "memory")
+    _numbers.real_number("memory", memory, _numbers.POSITIVE)
     if len(shape) != 3 or not all(size >= 1 for size in shape):  # of dask's, NaN: unknown
         raise ValueError(f"Invalid shape {tuple(shape)} of '{name}'. Must be (time, y, x), not 0.")
     frames, height, width = map(int, shape)

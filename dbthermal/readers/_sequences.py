@@ -1,6 +1,7 @@
 """Frames of numbers behind headers: bare ones, FLIR .sfmov with its rate in .inc, Telops .hcc."""
 
 import re
+import sys
 from pathlib import Path
 from typing import Any, Final
 
@@ -8,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from dbthermal import _numbers
 from dbthermal._arrays import Array
 from dbthermal.readers import _formats, _recording
 from dbthermal.readers._recording import MEMORY, Clock, Counts
@@ -71,9 +73,7 @@ def raw(
     # Form, as stated.
     order = _recording.byte_order(name, byte_order)
     for label, value in {"header": header, "frame_header": frame_header}.items():
-        _recording.check_number(value, f"{label} of '{name}'", whole=True)
-        if value < 0:
-            raise ValueError(f"Invalid {label} {value} of '{name}'. Must be 0 or more.")
+        _numbers.whole_number(f"{label} of '{name}'", value, (0, sys.maxsize))
     sizes = np.asarray(shape)
     frame = 2.0 * np.prod(sizes, dtype=float) if sizes.dtype.kind in "iu" else np.nan  # [byte]
     if sizes.shape != (2,) or not frame < 2**31 or sizes.min() < 1:
@@ -124,7 +124,7 @@ def sequence(path: str | Path, *, clock: Clock | None = None, memory: float = ME
     clock, memory
         As for `array`.
     """
-    _recording.check_number(memory, "memory")
+    _numbers.real_number("memory", memory, _numbers.POSITIVE)
     (path,) = _formats.files([path], "sequence")
     with _recording.damage_named(f"Damaged '{path.name}'", "a whole .sfmov or .hcc"):
         read = _sfmov if path.suffix.lower() == ".sfmov" else _hcc

@@ -10,11 +10,10 @@ import numpy.typing as npt
 import xarray as xr
 from scipy.constants import zero_Celsius
 
-from dbthermal import schema
+from dbthermal import _numbers, schema
 from dbthermal._arrays import empty, parts
 from dbthermal._text import shown
 from dbthermal._warnings import warned
-from dbthermal.readers import _recording
 from dbthermal.readers._recording import FileFlag
 
 _SCENE: Final = (5.0, 100.0)  # temperatures of a scene [degC]
@@ -138,7 +137,7 @@ def _offsets(cameras: Sequence[xr.Dataset], offset: Any) -> list[float]:
         return [(date - begun).total_seconds() for date in later]
     offsets = list(offset) if isinstance(offset, list | tuple) else [offset]
     for value in offsets:
-        _recording.check_number(value, "offset")
+        _numbers.real_number("offset [s]", value, _numbers.FINITE)
     if len(offsets) != len(cameras) - 1:
         raise ValueError(f"Invalid offset {offset} s. Must be one for each later recording.")
     return offsets

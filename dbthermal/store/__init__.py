@@ -4,7 +4,8 @@
 `join_parts` one whose rows several processes make; `save_figure`, `save_text` and `save_video` keep
 the rest of a result, each with the record from `provenance`. `Recording` grows in chunks and
 survives a kill or a power loss; a `HeldFolder` is found wherever it is moved. What is written
-appears `whole`, at a place that is `reserved` for one process. No other package writes zarr.
+appears `whole`, at a place that is `reserved` for one process. No other package writes zarr;
+`readers` opens stores of others.
 """
 
 from dbthermal.store._datasets import join_parts, open_dataset, save, save_rows

@@ -1,7 +1,4 @@
-"""Datasets on disk as zarr: saved whole, or by rows, and opened; recordings opened too.
-
-No other package writes zarr; `readers` opens stores of others.
-"""
+"""Datasets on disk as zarr: saved whole, or by rows, and opened; recordings opened too."""
 
 import json
 import math
@@ -84,11 +81,12 @@ def save(dataset: xr.Dataset, path: str | Path, provenance: Mapping[str, Any]) -
     >>> import xarray as xr
     >>> from tempfile import TemporaryDirectory
     >>> from dbthermal import store
-    >>> counts = xr.Dataset({"counts": ("band", [20310, 20750])})  # [count]
+    >>> wall = xr.Dataset({"object_temperature": ("time", [295.2, 295.3], {"units": "K"})})
     >>> with TemporaryDirectory() as folder:
-    ...     store.save(counts, f"{folder}/wall.zarr", store.provenance({"frames": 2}))
-    ...     store.open_dataset(f"{folder}/wall.zarr").counts.values.tolist()
-    [20310, 20750]
+    ...     store.save(wall, f"{folder}/wall.zarr", store.provenance({"frames": 2}))
+    ...     saved = store.open_dataset(f"{folder}/wall.zarr").load()
+    >>> saved.equals(wall), saved.attrs["provenance"]["parameters"]
+    (True, {'frames': 2})
     """
     schema.require(dataset, xr.Dataset, "dataset")
     _save([dataset], path, provenance)
@@ -139,9 +137,7 @@ def _save(
     blocks: Iterable[xr.Dataset], path: str | Path, provenance: Any, *sizes: int | None
 ) -> None:
     """Save blocks of rows, of a height and width that chunks then divide."""
-    if not isinstance(provenance, Mapping):
-        kind = type(provenance).__name__
-        raise TypeError(f"Invalid provenance of type {kind}. Must be a mapping, see `provenance`.")
+    schema.require(provenance, Mapping, "provenance")
     first, attrs = xr.Dataset(), {"provenance": json.loads(as_json(provenance))}
     with whole(path, ".zarr") as folder:
         folder.mkdir()
@@ -249,25 +245,13 @@ def open_dataset(path: str | Path) -> xr.Dataset:
     Returns
     -------
     Dataset
-        Identical to the one saved, with ``attrs["provenance"]`` added. Text is of NumPy's
-        fixed-length kind.
+        Identical to the one saved, with ``attrs["provenance"]`` added, as in the example of `save`.
+        Text is of NumPy's fixed-length kind.
 
     Warns
     -----
     UserWarning
         If the store has no checksums, as of dbthermal 0.1.0, so that damage cannot be seen.
-
-    Examples
-    --------
-    >>> import xarray as xr
-    >>> from tempfile import TemporaryDirectory
-    >>> from dbthermal import store
-    >>> wall = xr.Dataset({"object_temperature": ("time", [295.2, 295.3], {"units": "K"})})
-    >>> with TemporaryDirectory() as folder:
-    ...     store.save(wall, f"{folder}/wall.zarr", store.provenance({"frames": 2}))
-    ...     saved = store.open_dataset(f"{folder}/wall.zarr").load()
-    >>> saved.equals(wall), saved.attrs["provenance"]["parameters"]
-    (True, {'frames': 2})
     """
     if not texts.as_path(path).is_dir():
         rule = "Must be a zarr folder, as `save`, a notebook or a command leaves it"

@@ -200,8 +200,7 @@ def save_video(
     import av  # noqa: PLC0415 - optional, and nothing else here needs it
 
     # Codec and rate, before a file is made.
-    if codec not in _ENCODERS:
-        raise ValueError(f"Invalid codec {codec!r}. Must be one of {sorted(_ENCODERS)}.")
+    _text.check_listed("Invalid codec", codec, sorted(_ENCODERS))
     encoder, options = _ENCODERS[codec]
     frequency = _numbers.real_number("rate [Hz]", rate, (0.01, 1e6))
     with whole(path, ".mp4") as draft, av.open(draft, "w") as film:

@@ -29,6 +29,7 @@ except ImportError:  # Windows: there two processes may write to one place
     fcntl = None  # type: ignore[assignment]
 
 _THREADS: Final = 8
+_BUSY: Final = "Busy output '{}': {} writes to it. Must end first, or another output be named."
 _STATUS: Final = 128  # exit status of a shell's program that a signal ended, less its number
 _ENDING: Final = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
 _REPLACED: Final = "replaced"  # an earlier result, until the new one has its name
@@ -57,8 +58,7 @@ def check_place(path: str | Path, suffix: str) -> Path:
         folder = os.open(path, os.O_RDONLY)
         try:
             if not take(folder, shared=True):
-                rule = "Must end first, or another output be named"
-                raise BlockingIOError(f"Busy output '{path}': a recording writes to it. {rule}.")
+                raise BlockingIOError(_BUSY.format(path, "a recording"))
         finally:
             os.close(folder)
     for parent in path.resolve().parents:
@@ -154,8 +154,7 @@ def _lock(folder: Path, path: Path) -> int | None:
                     holder = os.read(lock, 200).decode(errors="replace") or "another process"
                     if holder == name:
                         return None
-                    rule = "Must end first, or another output be named"
-                    raise BlockingIOError(f"Busy output '{path}': {holder} writes to it. {rule}.")
+                    raise BlockingIOError(_BUSY.format(path, holder))
                 if os.path.samestat(os.fstat(lock), file.stat()):
                     with suppress(OSError):
                         os.ftruncate(lock, 0)

@@ -8,7 +8,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import _numbers, schema
-from dbthermal.correction._temporal import lag_coefficients
+from dbthermal.correction._temporal import time_constants
 from dbthermal.simulation import observe
 
 SPOILED: Final = ("good", "noisy", "blinking", "stuck")
@@ -184,7 +184,8 @@ def lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.Datase
     [0.0, 0.0, 63.0, 86.0, 95.0]
     """
     counts = _floating(corrected)
-    _, new = lag_coefficients(time_constant, counts)
+    interval = np.diff(counts["time"].values.astype(np.float64))
+    new = -np.expm1(-interval / time_constants(time_constant, counts)[:, np.newaxis])
     for movie, weight in zip(counts.values, new, strict=True):
         for frame in range(1, movie.shape[0]):
             # In place, each frame from the lagging one before.

@@ -30,6 +30,8 @@ from dbthermal.instruments.filterwheel import BSC10X, FilterWheel, Settings, Sta
 from dbthermal.instruments.tc08 import TC08
 from dbthermal.instruments.transport import EmulatedClock
 
+_ENDS = {Id.MOT_MOVE_COMPLETED, Id.MOT_MOVE_STOPPED, Id.MOT_MOVE_HOMED}  # of a motion
+
 
 @dataclass
 class WheelFaults:
@@ -130,7 +132,11 @@ class FaultyApt(EmulatedApt):
         return max(0.0, min([super().next_due(), *times]))
 
     def reply(self, identifier: Id, *arguments: Any, **options: Any) -> None:
-        """Send an answer, or lose it or add to it by a fault."""
+        """Send an answer or a report, or lose it, change its form or add to it by a fault."""
+        if identifier in _ENDS - {Id.MOT_MOVE_HOMED} and self.faults.long_reports:
+            arguments = (apt.pack(self.status()),)
+        elif identifier in _ENDS and self.faults.unreported:
+            return
         if self.faults.drop > 0:
             self.faults.drop -= 1
             return
@@ -139,13 +145,6 @@ class FaultyApt(EmulatedApt):
         if self.faults.stray_completed:
             super().reply(Id.MOT_MOVE_COMPLETED)
         super().reply(identifier, *arguments, **options)
-
-    def report(self, identifier: Id) -> None:
-        """Report the end of a motion, in another form or not at all by a fault."""
-        if self.faults.long_reports and identifier != Id.MOT_MOVE_HOMED:
-            self.reply(identifier, apt.pack(self.status()))
-        elif not self.faults.unreported:
-            super().report(identifier)
 
     def plan(self, drive: Drive) -> Drive:
         """Motion that is slower, shorter or endless by a fault."""
@@ -170,13 +169,20 @@ class FaultyApt(EmulatedApt):
         return status._replace(bits=status.bits | sum(stuck))
 
 
-request, reply = fslp.encode, partial(fslp.encode, status=0)
-"""Bytes of a request to a Boson, and of its reply."""
+def request(
+    sequence: int, command: int, data: bytes = b"", status: int = fslp.REQUEST, channel: int = 0
+) -> bytes:
+    """Bytes of a request to a Boson."""
+    return fslp.encode(fslp.Frame(channel, sequence, command, status, data))
+
+
+reply = partial(request, status=0)
+"""Bytes of its reply."""
 
 
 def text(sequence: int, command: int) -> bytes:
     """Bytes of debug text that a Boson sends unasked, on a channel of its own."""
-    return fslp.encode(sequence, command, b"emulated debug text", 0, channel=0x99)
+    return request(sequence, command, b"emulated debug text", 0, channel=0x99)
 
 
 class FaultyBoson(EmulatedBoson):

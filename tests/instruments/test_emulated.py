@@ -117,7 +117,7 @@ def test_what_does_not_fit_the_bench_is_named() -> None:
     with pytest.raises(ValueError, match="Repeated camera 'wide'"):
         world.add_camera("wide", 2)
     assert np.isnan(world.thermocouple_temperature(3))
-    with pytest.raises(KeyError, match="Unknown place 'moon' of thermocouple 4"):
+    with pytest.raises(KeyError, match="Unknown place of thermocouple 4 'moon'"):
         world.thermocouple_temperature(4)
 
 

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from rig_session import LEVELS, TEXT, from_yaml, replaced, rig, scene_text
 
+from dbthermal import store
 from dbthermal.__main__ import main
+from dbthermal._cli import files
 from dbthermal._cli import record as command
 from dbthermal.instruments import inventory, protocols, recording
 from dbthermal.instruments.devices import Devices, open_devices
@@ -69,6 +71,28 @@ def test_scene_of_a_simulated_blackbody(tmp_path: Path) -> None:
     capture = open_capture(tmp_path / "recorded" / "plate.zarr")
     assert capture.attrs["is_simulated"] is True
     assert float(capture["counts"].std("x").mean()) > 1
+
+
+def test_a_recording_is_described(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`info` takes a recording, whose session leaves settings of its devices open."""
+    assert run(tmp_path, scene_text()) == 0
+    assert main(["info", str(tmp_path / "recorded" / "plate.zarr")]) == 0
+    said = capsys.readouterr().out
+    assert "stage: capture" in said
+    assert "wheel: serial_number None, home_offset " in said
+
+
+def test_what_is_made_of_a_recording_is_none(tmp_path: Path) -> None:
+    """A capture without exposure times, as an aligned one, keeps its clock, and is not listed."""
+    assert run(tmp_path, scene_text()) == 0
+    capture = open_capture((folder := tmp_path / "recorded") / "plate.zarr")
+    aligned = capture.isel(time=slice(2, None)).drop_vars("exposure_time")
+    store.save(aligned, folder / "aligned.zarr", store.provenance({}))
+    opened = files.opened(folder / "aligned.zarr")
+    np.testing.assert_array_equal(opened["time"], aligned["time"])
+    assert {*recording.overview(folder)["recording"].values} == {"plate"}
+    with pytest.raises(ValueError, match=r"No recording .*aligned\.zarr'\. Must be"):
+        open_capture(folder / "aligned.zarr")
 
 
 @pytest.mark.parametrize(

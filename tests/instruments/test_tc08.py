@@ -65,6 +65,14 @@ def test_unit_is_opened_and_closed(rig: LoggerBench) -> None:
         rig.driver.single()
 
 
+def test_channels_that_are_set_later_are_read(rig: LoggerBench) -> None:
+    """A scan from before a channel was set says nothing of it."""
+    rig.driver.open().set_channels({1: "plate"})
+    assert rig.driver.read(1) == pytest.approx(350.0, abs=FLOAT32)
+    rig.driver.set_channels({1: "plate", 2: "room"})
+    assert rig.driver.read(2) == pytest.approx(300.0, abs=FLOAT32)
+
+
 def test_firmware_download_is_waited_for(rig: LoggerBench) -> None:
     """Opening takes as long as the firmware's download, if that ends and a unit is there."""
     rig.unit.faults.firmware_delay = 6.0

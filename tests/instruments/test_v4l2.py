@@ -214,6 +214,21 @@ def test_no_frame_in_time(answers: list[tuple[int, int, int, int]]) -> None:
         assert capture.read(0.1).sequence == 5
 
 
+def test_frames_that_are_never_there_do_not_prolong_the_wait() -> None:
+    """A driver that announces frames without end, and has none, ends a read at its time limit."""
+    driver = Driver(answers=[(-1, 0, 0, 0)] * 200)
+    kernel = driver.kernel()
+
+    def select(*_: object) -> tuple[list[int], list[int], list[int]]:
+        kernel.clock.sleep(0.01)
+        return [3], [], []
+
+    with v4l2.Capture("/dev/video0", STREAM, replace(kernel, select=select)) as capture:
+        with pytest.raises(NoFrameError, match="No frame from '/dev/video0'"):
+            capture.read(0.1)
+        assert len(driver.answers) > 180
+
+
 def test_unplugging_is_told_and_close_still_works() -> None:
     """The last frame before unplugging is returned, then reads are errors; the node is closed."""
     driver = Driver(answers=[(BYTES, GOOD, 0, 5)])

@@ -95,7 +95,7 @@ MILLISECONDS = xr.DataArray(100.0 * np.arange(3), dims="time", attrs={"units": "
         ),
         (scene().tolist(), {}, "Invalid dtype int64 of 'array'"),
         *(
-            (scene(), {"memory": m}, "memory.*Must be a finite number")
+            (scene(), {"memory": m}, "memory.*Must be (a number|finite)")
             for m in ("1e9", np.nan, True)
         ),
         (scene(), {"unit": ["count"]}, "unit.*Must be 'count'"),

@@ -145,10 +145,10 @@ def test_raw(tmp_path: Path) -> None:
         bare(path, shape=(1_000_000, 1_000_000))
     with pytest.raises(ValueError, match=r"Invalid shape \(0, 32\)"):
         bare(path, shape=(0, 32))
-    with pytest.raises(ValueError, match="Invalid frame_header -1"):
+    with pytest.raises(ValueError, match=r"Invalid frame_header of .a.raw. -1"):
         bare(path, frame_header=-1)
     for argument, value in {"header": "0", "frame_header": 1.5, "memory": "1e9"}.items():
-        with pytest.raises(TypeError, match=rf"Invalid {argument} .*{value}.*Must be a .* number"):
+        with pytest.raises(TypeError, match=rf"Invalid {argument} .*{value}.*Must be a .*number"):
             bare(path, byte_order="big", **{argument: value})
     for argument, wrong in {"shape": ("24", 32), "unit": ["count"], "byte_order": ["big"]}.items():
         with pytest.raises(ValueError, match=rf"Invalid {argument} .*a\.raw'\. Must be"):

@@ -125,9 +125,9 @@ def test_what_makes_no_capture(pair: tuple[xr.Dataset, xr.Dataset], name: str) -
     ("argument", "value", "message"),
     [
         ("offset", 100.0, r"Invalid offset 100 s: .* do not overlap"),
-        ("offset", np.nan, r"Invalid offset nan\. Must be a finite number"),
-        ("offset", "0", r"Invalid offset '0'\. Must be a finite number"),
-        ("offset", True, r"Invalid offset True\. Must be a finite number"),
+        ("offset", np.nan, r"Invalid offset \[s\] nan\. Must lie in"),
+        ("offset", "0", r"Invalid offset \[s\] '0'\. Must be a number"),
+        ("offset", True, r"Invalid offset \[s\] True\. Must be a number"),
         ("bands", "ab", "Invalid bands 'ab'. Must be 2 different names"),
         ("bands", ("a", "a"), r"Invalid bands \('a', 'a'\). Must be 2 different names"),
         *(

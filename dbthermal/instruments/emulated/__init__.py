@@ -24,6 +24,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from dbthermal import _text as texts
 from dbthermal import response as responses
 from dbthermal import simulation
 from dbthermal.bands import FILTERS
@@ -66,37 +67,26 @@ class CameraState:
     last_ffc_temperature: float = FPA  # fpa_temperature at its start [K]
 
 
+@dataclass(kw_only=True, eq=False)
 class World:
-    """An emulated bench: wheel, blackbody, scene and cameras, on one `clock` [s].
+    """An emulated bench: wheel, blackbody, scene and cameras, on one clock.
 
-    Its clock is an `EmulatedClock`, or `dbthermal.instruments.transport.SYSTEM` for real time.
-    `filters` has the band in each slot of the wheel, 1 to 6, and `wheel_position` is the slot in
-    the beam, None while the wheel turns or is between two slots. `scene` has temperatures [K] by
-    name at a time of the scene [s]; if it `waits` it stands at its beginning until `begin`.
-    `thermocouples` has the place of each channel, 1 to 8: a name in the scene, ``"blackbody"``,
-    ``"room"`` or ``"open"``. Single attributes may be read and set from any thread; to change
-    several together, hold `lock`.
+    Single attributes may be read and set from any thread; to change several together, hold `lock`.
     """
 
-    def __init__(
-        self,
-        *,
-        clock: Clock | None = None,
-        filters: Mapping[int, str] | None = None,
-        wheel_position: int = 1,
-        blackbody_temperature: float = ROOM,
-        scene: Callable[[float], Mapping[str, float]] | None = None,
-        waits: bool = False,
-    ) -> None:
-        self.lock = threading.RLock()
-        self.clock = clock or EmulatedClock()
-        self.filters = dict(filters or {})
-        self.thermocouples: dict[int, str] = {}
-        self.cameras: dict[str, CameraState] = {}
-        self.blackbody_temperature = blackbody_temperature
-        self.scene_began = math.inf if waits else self.clock()
-        self._scene = scene
-        self.wheel_position: int | None = wheel_position
+    clock: Clock = field(default_factory=EmulatedClock)  # or `SYSTEM`, for real time [s]
+    filters: Mapping[int, str] = field(default_factory=dict)  # band in each slot, 1 to 6
+    wheel_position: int | None = 1  # slot in the beam; None while it turns, or is between two slots
+    blackbody_temperature: float = ROOM  # [K]
+    # Temperatures [K] by name at a time of the scene [s]; if it waits, it stands until `begin`.
+    scene: Callable[[float], Mapping[str, float]] = lambda _: {}
+    waits: bool = False
+    # Place of each channel, 1 to 8: a name in the scene, "blackbody", "room" or "open".
+    thermocouples: dict[int, str] = field(default_factory=dict)
+    cameras: dict[str, CameraState] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.lock, self.scene_began = threading.RLock(), math.inf if self.waits else self.clock()
 
     def begin(self) -> None:
         """Let the scene begin now, or anew."""
@@ -113,7 +103,7 @@ class World:
 
     def scene_temperatures(self) -> dict[str, float]:
         """Temperatures [K] in the scene by name, with ``"blackbody"`` and ``"room"``."""
-        scene = {} if self._scene is None else self._scene(self.scene_time())
+        scene = self.scene(self.scene_time())
         return {"room": ROOM, **scene, "blackbody": self.blackbody_temperature}
 
     def thermocouple_temperature(self, channel: int) -> float:
@@ -125,9 +115,8 @@ class World:
         if place == "open":
             return math.nan
         temperatures = self.scene_temperatures()
-        if place not in temperatures:
-            rule = f"Must be one of {sorted(temperatures)}"
-            raise KeyError(f"Unknown place '{place}' of thermocouple {channel}. {rule}.")
+        label = f"Unknown place of thermocouple {channel}"
+        texts.check_listed(label, place, sorted(temperatures), KeyError)
         return temperatures[place]
 
     def add_camera(self, name: str, serial_number: int) -> CameraState:
@@ -140,8 +129,7 @@ class World:
 
     def camera(self, name: str) -> CameraState:
         """State of a camera, shared by all emulators; KeyError if none has this name."""
-        if name not in self.cameras:
-            raise KeyError(f"Unknown camera '{name}'. Must be one of {sorted(self.cameras)}.")
+        texts.check_listed("Unknown camera", name, sorted(self.cameras), KeyError)
         return self.cameras[name]
 
     def furnish(self, session: Session) -> None:
@@ -194,9 +182,7 @@ class EmulatedCamera(Closing):
     is_simulated: bool = field(default=True, init=False)
 
     def __post_init__(self) -> None:
-        if self.kind not in MODELS:
-            rule = f"Must be one of {sorted(MODELS)}"
-            raise ValueError(f"Unknown emulated camera '{self.kind}'. {rule}.")
+        texts.check_listed("Unknown emulated camera", self.kind, sorted(MODELS))
         self.clock, self._state = self.world.clock, self.world.camera(self.name)
         self._state.has_frames = True
         self.identity: Mapping[str, str] = {
@@ -267,8 +253,7 @@ class EmulatedCamera(Closing):
         band = self.band or self.world.filter_name
         if band is None:
             return np.full(self.shape, CLOSED, dtype=np.uint16)
-        if band not in self.pictures:
-            raise KeyError(f"Unknown band '{band}'. Must be one of {sorted(self.pictures)}.")
+        texts.check_listed("Unknown band", band, sorted(self.pictures), KeyError)
         image = self.pictures[band](self.world.scene_time(time))
         if image.shape != self.shape or image.dtype != np.uint16:
             label = f"Invalid picture {image.shape} of {image.dtype} in band '{band}'"

@@ -18,7 +18,7 @@ import math
 import struct
 import threading
 from collections.abc import Callable, MutableSequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -149,7 +149,7 @@ class EmulatedBoson(Line):
                 (self.settings[command],) = struct.unpack(">i", data)
             else:
                 answer = readings[command]
-        return _fslp.encode(request.sequence, command, answer, status)
+        return _fslp.encode(replace(request, status=status, data=answer))
 
     def _readings(self) -> dict[int, bytes]:
         """Data of every reading and setting, by the identifier that reads it."""
@@ -270,7 +270,7 @@ class EmulatedApt(Line):
                 self.start(target - self.position, velocity)
             case Id.MOT_MOVE_STOP:  # at once, ramps are left out
                 self._drive = None
-                self.report(Id.MOT_MOVE_STOPPED)
+                self.reply(Id.MOT_MOVE_STOPPED)
 
     def start(self, distance: float, velocity: float, *, homing: bool = False) -> None:
         """Begin a motion [count], unless the motor has no current or is too slow [device units]."""
@@ -286,10 +286,6 @@ class EmulatedApt(Line):
     def plan(self, drive: Drive) -> Drive:
         """Motion as it is carried out; replaced in tests."""
         return drive
-
-    def report(self, identifier: Id) -> None:
-        """Report the end of a motion, without a request."""
-        self.reply(identifier)
 
     def reply(self, identifier: Id, data: bytes = b"", value: int = 0, source: int = 0) -> None:
         """Send a message, of channel 1 without data; by default from the motor's address."""
@@ -317,7 +313,7 @@ class EmulatedApt(Line):
                 self._drive = None
                 if drive.homing:
                     self.position, self.homed = 0, True
-                self.report(Id.MOT_MOVE_HOMED if drive.homing else Id.MOT_MOVE_COMPLETED)
+                self.reply(Id.MOT_MOVE_HOMED if drive.homing else Id.MOT_MOVE_COMPLETED)
         # The slot that is in the beam of a wheel at rest.
         slot = self.model.position(self.wheel, self.slot_offset, WINDOW)
         self.world.wheel_position = slot if self._drive is None else None

@@ -54,8 +54,8 @@ _WHOLE: Final = 0.95  # share of the promised frames with which a recording is w
 def open_capture(path: str | Path, *, fitted: bool = False) -> xr.Dataset:
     """Open a recording as stage `capture`, also one that was cut short or is being written.
 
-    FileNotFoundError or ValueError if the folder does not exist, a band has fewer than two frames
-    with a time, or as `dbthermal.store.open_dataset`.
+    FileNotFoundError or ValueError if the folder does not exist or is no recording, a band has
+    fewer than two frames with a time, or as `dbthermal.store.open_dataset`.
 
     Parameters
     ----------
@@ -73,21 +73,12 @@ def open_capture(path: str | Path, *, fitted: bool = False) -> xr.Dataset:
         for a frame that is damaged, missing or not new; `frame_flags` (band, time), with bit
         ``shutter_closed``; `device_time`, `host_time`, `sequence`, and the camera's telemetry, if
         any. `time` is when the first band was exposed [s]. If fitted, attribute ``clock_rates`` has
-        b of each band.
-
-    Examples
-    --------
-    >>> from dbthermal.instruments import devices, protocols, recording, session
-    >>> camera = session.Camera("v4l2:///dev/video0")
-    >>> plan = session.Session("pot", True, "scene", 0.2, {"8-14": camera}, shape=(24, 32))
-    >>> path, limits = getfixture("tmp_path") / "pot.zarr", recording.Limits(reserve=0)
-    >>> with devices.open_devices(plan) as rig:
-    ...     summary = protocols.record_scene(rig, path, limits=limits)
-    >>> recording.open_capture(path)["counts"].dims
-    ('band', 'time', 'y', 'x')
+        b of each band. See the example of `dbthermal.instruments.protocols.record_scene`.
     """
     recording = store.open_dataset(path)
-    opened = recording.drop_dims("log", errors="ignore").drop_vars("time", errors="ignore")
+    if "log_time" not in recording:  # its frames would count as a second apart
+        raise ValueError(f"No recording '{path}'. Must be, or be opened by store.open_dataset.")
+    opened = recording.drop_dims("log").drop_vars("time", errors="ignore")
     opened = _fitted(opened) if fitted else opened
     # Exposure times are checked against a coordinate, which is made of them.
     numbered = opened.assign_coords(time=np.arange(opened.sizes["time"], dtype=np.float64))
@@ -151,7 +142,8 @@ def overview(folder: str | Path) -> xr.Dataset:
     rows = []
     for path in sorted(Path(folder).glob("*.zarr")):
         attrs = (recording := store.open_dataset(path)).attrs
-        for band, number in attrs.get("frames_written", {}).items():
+        is_recording = "log_time" in recording  # what is made of it has its attributes, and no log
+        for band, number in attrs["frames_written"].items() if is_recording else ():
             frames = recording.sel(band=band).isel(time=slice(0, number))
             steps = np.diff(frames["device_time"].values[_good(frames, UNTIMED)])
             session = attrs["provenance"]["parameters"]
@@ -252,12 +244,12 @@ def bench_series(
     series: dict[str, list[xr.Dataset]] = {material: [] for material in region}
     for paths in steps:
         background = _agreed(paths, BLACKBODY, stability)
-        captures = _bands(paths)
+        views = _views(paths)
         for material, place in region.items():
-            means = [_mean(captures[band], band, place, correction) for band in captures]
+            means = [_mean(view, place, correction) for view in views.values()]
             temperature = _agreed(paths, material, stability)
             values = {"object_temperature": temperature, "background_temperature": background}
-            measurement = xr.Dataset({"counts": ("band", means), **values}, {"band": [*captures]})
+            measurement = xr.Dataset({"counts": ("band", means), **values}, {"band": [*views]})
             series[material].append(measurement)
     # All steps of a material together.
     joined = {}
@@ -342,42 +334,39 @@ def _agreed(paths: list[Path], source: str, stability: float) -> float:
     return float(np.mean(means))
 
 
-def _bands(paths: list[Path]) -> dict[str, xr.Dataset]:
-    """Each band with the first recording that has it."""
-    captures: dict[str, xr.Dataset] = {}
+def _views(paths: list[Path]) -> dict[str, xr.Dataset]:
+    """Counts of each band, of the first recording that has it.
+
+    Of the frames that are whole, have a time, and show the view.
+    """
+    views: dict[str, xr.Dataset] = {}
     for path in paths:
         capture = open_capture(path).assign_attrs(path=str(path))
         for band in map(str, capture["band"].values):
-            captures.setdefault(band, capture)
-    return captures
-
-
-def _good_frames(capture: xr.Dataset, band: str) -> npt.NDArray[np.intp]:
-    """Positions in `time` of a band's frames that are whole, have a time, and show the view."""
-    good = _good(capture.sel(band=band), FrameFlag.SHUTTER_CLOSED, "exposure_time")
-    return np.flatnonzero(good)
+            good = _good(capture.sel(band=band), FrameFlag.SHUTTER_CLOSED, "exposure_time")
+            view = capture[["counts"]].sel(band=[band]).isel(time=np.flatnonzero(good))
+            views.setdefault(band, view)
+    return views
 
 
 def _movie(paths: list[Path], frames: int) -> xr.DataArray:
     """Counts (band, frame, y, x) of a step."""
     films = []
-    for band, capture in _bands(paths).items():
-        good = _good_frames(capture, band)
-        if good.size < frames:
-            text = f"with {good.size} good frames in band '{band}'. Must have {frames}"
-            raise ValueError(f"Invalid recording '{capture.attrs['path']}' {text}.")
-        # Read in one piece, up to the last frame that is needed.
-        counts = capture["counts"].sel(band=band).isel(time=slice(0, int(good[frames - 1]) + 1))
-        films.append(counts.load().isel(time=good[:frames]).drop_vars("time").rename(time="frame"))
+    for band, view in _views(paths).items():
+        if (number := view.sizes["time"]) < frames:
+            text = f"with {number} good frames in band '{band}'. Must have {frames}"
+            raise ValueError(f"Invalid recording '{view.attrs['path']}' {text}.")
+        counts = view["counts"].isel(time=slice(frames)).load()
+        films.append(counts.drop_vars("time").rename(time="frame"))
     return xr.concat(films, dim="band")
 
 
-def _mean(capture: xr.Dataset, band: str, region: Place, correction: xr.Dataset | None) -> float:
-    """Mean counts of a region in the good frames of a band."""
+def _mean(view: xr.Dataset, region: Place, correction: xr.Dataset | None) -> float:
+    """Mean counts of a region in a band."""
     place = {"y": region[0], "x": region[1]}
-    good = _good_frames(capture, band)
-    cropped = capture[["counts"]].sel(band=[band]).isel(time=good).isel(place)
-    counts, source = cropped["counts"], f"of band '{band}' in '{capture.attrs['path']}'"
+    cropped = view.isel(place)
+    counts = cropped["counts"]
+    source = f"of band '{view['band'].item()}' in '{view.attrs['path']}'"
     if counts.size == 0:
         raise ValueError(f"No frame or no pixel {source}. Must have one.")
     if correction is not None:

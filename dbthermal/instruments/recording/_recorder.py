@@ -128,6 +128,12 @@ def record(
     after the start such a stamp counts as wrong. If the folder, or one above it, is renamed or
     moved on its disk, the recording goes on in it.
 
+    FileExistsError if `path` exists, ValueError if the sources are not those of the session, or
+    emulated and it is not, OSError if there is too little space, or the folder or one in it was
+    deleted or replaced. An error of a source, a reading or the preview, an interrupt by the
+    keyboard, and SIGTERM or SIGHUP in the main thread, as `SignalExit`, are raised when what was
+    recorded is kept; a second interrupt ends the wait, not the writing.
+
     Parameters
     ----------
     session, sources : Session, mapping
@@ -139,17 +145,6 @@ def record(
     limits, preview : optional
         `Limits`; and a function called now and then with a `Preview` in the caller's thread, which
         may take its time.
-
-    Raises
-    ------
-    FileExistsError, ValueError
-        If `path` exists; or the sources are not those of the session, or emulated and it is not.
-    OSError
-        If there is too little space, or the folder or one in it was deleted or replaced.
-    Exception, SignalExit
-        Error of a source, a reading or the preview, an interrupt by the keyboard, or SIGTERM or
-        SIGHUP in the main thread. In all cases what was recorded is kept; a second interrupt ends
-        the wait, not the writing.
     """
     limits, clock = limits or Limits(), _check(session, sources)
     with raised_signals(), clock.joined():
@@ -227,7 +222,7 @@ class _Run:
         self.over, self.done = threading.Event(), threading.Event()
         self.errors: list[BaseException] = []
         self.interrupted, self.ended = "", ""
-        # For the preview, after each frame is written: totals, last frames, last readings.
+        # For the preview: totals and last frames that are written, and last readings.
         self.totals: Totals = {}
         self.last_frames: dict[str, camera.Frame] = {}
         self.last_readings: dict[str, float] = {}
@@ -256,7 +251,7 @@ class _Run:
             self.over.set()
 
     def _put_note(self, kind: Note, source: str, value: float = math.nan) -> None:
-        self._work.put(partial(self._note, kind, source, self.clock(), value))
+        self._work.put(partial(self.file.note, kind, source, self.clock(), value))
 
     def _fetch(self, band: str, source: camera.FrameSource) -> None:
         """Queue the frames of a source for the writer, until the end.
@@ -291,6 +286,7 @@ class _Run:
                 except (OSError, RuntimeError, ValueError):
                     value, kind = math.nan, Note.READING_FAILED
                 self._put_note(kind, name, value)
+                self.last_readings[name] = value
             remaining = max(0.0, self.end - self.clock())
             self.clock.wait(self.over, min(self.limits.reading_period, remaining))
 
@@ -355,11 +351,6 @@ class _Run:
         self._written += 1
         if self._written % self.limits.chunk == 0 and self._is_going():
             _check_space(self.file.recording.root, self.limits.reserve)
-
-    def _note(self, kind: Note, source: str, time: float, value: float) -> None:
-        self.file.note(kind, source, time, value)
-        if kind in {Note.READING, Note.READING_FAILED}:
-            self.last_readings[source] = value
 
 
 def _check_space(path: Path, least: int) -> None:
