@@ -11,6 +11,7 @@ import numpy as np
 import xarray as xr
 
 from dbthermal import _numbers, alignment, schema
+from dbthermal._arrays import Array
 from dbthermal._warnings import warned
 from dbthermal.alignment._planes import Scale, share_displaced
 from dbthermal.alignment._reflections import seen_apart
@@ -158,8 +159,9 @@ def separate(  # noqa: PLR0913 - all but the first two by name
         )
 
     # Separate, and widen the bars by what is left.
-    capture, outcome, synchronised = _on_one_clock(laid.capture if laid else corrected, once)
+    capture, outcome, late, detail = _on_one_clock(laid.capture if laid else corrected, once)
     capture, (measured, misfit), mended = _mended(capture, outcome, once)
+    misfit, mended = replace(misfit, change=np.hypot(misfit.change, detail)), late + mended
     if laid:
         left = laid.detail(measured.inputs, measured.result)
         misfit = replace(misfit, change=np.hypot(misfit.change, left))
@@ -170,7 +172,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     misfits.widen(measured.inputs, result, misfit)
     # Complete what is still unknown.
     context = replace(context, materials=materials, reflection_shift=measured.reflection_shift)
-    doubts = measured.doubts + synchronised + mended
+    doubts = measured.doubts + mended
     if completable:
         result = filled(result, capture, response, context, workers)
     else:
@@ -187,31 +189,39 @@ def separate(  # noqa: PLR0913 - all but the first two by name
 
 def _on_one_clock(
     capture: xr.Dataset, once: Callable[..., tuple["Measured", Misfit]]
-) -> tuple[xr.Dataset, tuple["Measured", Misfit], list[str]]:
+) -> tuple[xr.Dataset, tuple["Measured", Misfit], list[str], Array | float]:
     """Separate; again on one clock, if the bands show the same at different times.
 
-    Returns the capture on one clock, what was measured and what is left, and what was done.
+    Returns the capture on one clock, what was measured and what is left, what was done, and by how
+    much the object (y, x) [K] hangs on which of the clocks that is.
     """
     outcome = once(capture)
     names, share = capture["band"].values.tolist(), _asynchronous(outcome[0].result)
     if share <= _SOME:
-        return capture, outcome, []
+        return capture, outcome, [], 0.0
     try:
-        aligned = alignment.align(capture, clock=names[0]).assign_coords(time=capture["time"])
+        aligned = alignment.align(capture, clock=names[0])
     except ValueError:  # nothing tells the clocks: the pixels keep the flag
-        return capture, outcome, []
-    retry = once(aligned)
+        return capture, outcome, [], 0.0
+    retry = once(aligned.assign_coords(time=capture["time"]))
     if not _asynchronous(retry[0].result) < _LESS * share:
-        return capture, outcome, []
-    offsets, std = aligned.attrs["time_offset"][1:], aligned.attrs.get("time_offset_std", np.nan)
-    late = ", ".join(
-        f"'{band}' {offset:+.3f}" for band, offset in zip(names[1:], offsets, strict=True)
-    )
+        return capture, outcome, [], 0.0
+    offsets, std = np.array(aligned.attrs["time_offset"]), aligned.attrs.get("time_offset_std")
+    late = names[np.abs(offsets).argmax()]
+    detail: Array | float = 0.0
+    if np.any(aligned["noise_factor"] < schema.noise_factor(capture)):
+        # Between frames the rapid changes of the band that is interpolated are too small.
+        offset = xr.DataArray(offsets, {"band": names}, "band")
+        second = once(alignment.align(capture, offset=offset, clock=late))[0].result
+        films = [result["object_temperature"] for result in (retry[0].result, second)]
+        change = films[1].interp(time=aligned["time"]) - films[0].values
+        detail = np.nan_to_num(0.5 * np.sqrt((change**2).mean("time").values))
+    known = "" if std is None else f", known to {std:.4f} s"
     sentence = (
-        f"The clocks differ: frames were taken for {late} s later than those of '{names[0]}', "
-        f"known to {std:.3f} s, and interpolated to these."
+        f"The clocks differ: band '{late}' was taken {offsets[np.abs(offsets).argmax()]:+.4f} s "
+        f"after '{names[0]}'{known}, and was interpolated."
     )
-    return aligned, retry, [sentence]
+    return retry[0].inputs.capture, retry, [sentence], detail
 
 
 def _mended(
