@@ -159,9 +159,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
         )
 
     # Separate, and widen the bars by what is left.
-    capture, outcome, late, detail = _on_one_clock(laid.capture if laid else corrected, once)
-    capture, (measured, misfit), mended = _mended(capture, outcome, once)
-    misfit, mended = replace(misfit, change=np.hypot(misfit.change, detail)), late + mended
+    capture, (measured, misfit), mended = _mended(laid.capture if laid else corrected, once)
     if laid:
         left = laid.detail(measured.inputs, measured.result)
         misfit = replace(misfit, change=np.hypot(misfit.change, left))
@@ -196,15 +194,16 @@ def _on_one_clock(
     much the object (y, x) [K] hangs on which of the clocks that is.
     """
     outcome = once(capture)
-    names, share = capture["band"].values.tolist(), _asynchronous(outcome[0].result)
+    names, share = capture["band"].values.tolist(), outcome[0].asynchronous
     if share <= _SOME:
         return capture, outcome, [], 0.0
     try:
         aligned = alignment.align(capture, clock=names[0])
     except ValueError:  # nothing tells the clocks: the pixels keep the flag
         return capture, outcome, [], 0.0
-    retry = once(aligned.assign_coords(time=capture["time"]))
-    if not _asynchronous(retry[0].result) < _LESS * share:
+    times, aligned = aligned["time"], aligned.assign_coords(time=capture["time"])
+    retry = once(aligned)
+    if not retry[0].asynchronous < _LESS * share:
         return capture, outcome, [], 0.0
     offsets, std = np.array(aligned.attrs["time_offset"]), aligned.attrs.get("time_offset_std")
     late = names[np.abs(offsets).argmax()]
@@ -214,27 +213,25 @@ def _on_one_clock(
         offset = xr.DataArray(offsets, {"band": names}, "band")
         second = once(alignment.align(capture, offset=offset, clock=late))[0].result
         films = [result["object_temperature"] for result in (retry[0].result, second)]
-        change = films[1].interp(time=aligned["time"]) - films[0].values
+        change = films[1].interp(time=times) - films[0].values
         detail = np.nan_to_num(0.5 * np.sqrt((change**2).mean("time").values))
     known = "" if std is None else f", known to {std:.4f} s"
     sentence = (
         f"The clocks differ: band '{late}' was taken {offsets[np.abs(offsets).argmax()]:+.4f} s "
         f"after '{names[0]}'{known}, and was interpolated."
     )
-    return retry[0].inputs.capture, retry, [sentence], detail
+    return aligned, retry, [sentence], detail
 
 
 def _mended(
-    original: xr.Dataset,
-    outcome: tuple["Measured", Misfit],
-    once: Callable[..., tuple["Measured", Misfit]],
+    original: xr.Dataset, once: Callable[..., tuple["Measured", Misfit]]
 ) -> tuple[xr.Dataset, tuple["Measured", Misfit], list[str]]:
-    """Separate again, while what is left shows that cameras move, or that their blurs differ.
+    """Separate; again, while what is left shows that clocks or blurs differ, or cameras move.
 
     Returns the capture as mended, what was measured and what is left, and what was done.
     """
-    capture, motion, sentences, left = original, None, list[str](), np.zeros(())
-    measured, misfit = outcome
+    original, (measured, misfit), late, left = _on_one_clock(original, once)
+    capture, motion, sentences = original, None, list[str]()
     for _ in range(_ROUNDS):
         steady = stabilise(original, measured.inputs, measured.result, misfit, motion)
         retry = None if steady is None else once(steady.capture)
@@ -255,10 +252,11 @@ def _mended(
     if alike and retry and _measured(retry[0]) > _KEPT * _measured(measured):
         measured, less = retry
         # Noise that is not white is told before: a blur takes rapid noise alone.
-        less = replace(less, change=np.hypot(less.change, alike.detail), single=misfit.single)
+        detail = np.hypot(left, alike.detail)
+        less = replace(less, change=np.hypot(less.change, detail), single=misfit.single)
         capture, outcome = alike.capture, (measured, less)
         sentences.append(alike.sentence)
-    return capture, outcome, sentences
+    return capture, outcome, late + sentences
 
 
 def _measured(measured: "Measured") -> int:
@@ -275,6 +273,14 @@ class Measured:
     materials: xr.DataArray | None
     reflection_shift: xr.Dataset | None
     doubts: list[str]
+
+    @property
+    def asynchronous(self) -> float:
+        """Share of the pixels with moving reflections whose bands do not show the same."""
+        status = self.result["status"].values
+        moving = (status & np.uint32(schema.UNMEASURED | Status.NO_BACKGROUND_MOTION)) == 0
+        apart = ((status & np.uint32(Status.BANDS_APART)) != 0) & moving
+        return float(apart.sum() / max(moving.sum(), 1))
 
 
 def _separated(
@@ -295,8 +301,10 @@ def _separated(
         inputs = replace(inputs, displacement=shift)
     # Separate each pixel.
     alone, surveys = separated(inputs, workers=workers, progress=progress)
-    doubts = [] if reflection_shift is None else _unexplained(alone)
-    doubts += [_UNEXPLAINED.format(share)] if share > 0.0 else []
+    if reflection_shift is not None:
+        share = Measured(alone, inputs, None, reflection_shift, []).asynchronous
+    unexplained = share > (0.0 if reflection_shift is None else _MANY)
+    doubts = [_UNEXPLAINED.format(share)] if unexplained else []
     # Pool the pixels of each material, and hold them to what each tells by itself.
     result = alone
     pool = partial(separated, alone=alone, surveys=surveys, workers=workers, progress=progress)
@@ -352,17 +360,3 @@ def _shift(corrected: xr.Dataset, response: xr.Dataset) -> tuple[xr.Dataset | No
             if seen_apart(shift):
                 return shift, 0.0
     return None, share
-
-
-def _unexplained(per_pixel: xr.Dataset) -> list[str]:
-    """Doubt about a shift of the reflections with which bands are apart in many pixels."""
-    share = _asynchronous(per_pixel)
-    return [_UNEXPLAINED.format(share)] if share > _MANY else []
-
-
-def _asynchronous(result: xr.Dataset) -> float:
-    """Share of the pixels with moving reflections whose bands do not show the same."""
-    status = result["status"].values
-    moving = (status & np.uint32(schema.UNMEASURED | Status.NO_BACKGROUND_MOTION)) == 0
-    asynchronous = ((status & np.uint32(Status.BANDS_APART)) != 0) & moving
-    return float(asynchronous.sum() / max(moving.sum(), 1))
