@@ -36,6 +36,9 @@ from dbthermal.separation._tiles import BROKEN, Mask, Material, Survey
 BLUR: Final = 1.0
 """Deviation of the blur of the bands whose ratios are compared [pixel]."""
 
+SHARING: Final = 4.0 * np.pi * BLUR**2
+"""Pixels that share an error of such a ratio: the inverse sum of the blur's squared weights."""
+
 BLURS: Final = (0.0, BLUR, 2.0 * BLUR)
 """Those of a material, each wider than the one before."""
 

@@ -55,6 +55,8 @@ def alone(inputs: Inputs, result: xr.Dataset, separate_pixels: Each, threads: Ex
         inputs = replace(inputs, difference=objects.difference)
     if objects is not None or material is not None:
         separate_pixels(inputs, material)
+    if material is not None:
+        result["reflection_ratio_std"].attrs["pixels"] = neighbours.SHARING
     if objects is not None:
         objects.finish(result)
     displacement.found[_OBJECTS] = objects

@@ -111,7 +111,8 @@ def materials(
     Two regions are compared by the pooled ratio of each band, an inverse-variance mean, and by the
     emissivity of the reference band. The error of an emissivity is one that neighbours share (the
     background's slow part), so its mean is taken to be no surer than that of one pixel. The
-    deviations of the ratios of several bands are taken as independent.
+    deviations of the ratios of several bands are taken as independent, and those of pixels, but as
+    many as an attribute `pixels` of their deviation says, which share one.
 
     Borders are found within 2 pixels. A pixel beside another material stays with its own if its own
     ratio tells the two apart, by three standard deviations; else, and where nothing moved and the
@@ -143,7 +144,7 @@ def materials(
     ratios, features = _features(result, bands)
     valid = np.all(np.isfinite(means), axis=0) & (result["status"].values & int(_UNUSABLE) == 0)
     cells = _cells(ratios, means, variances, valid, error_rate)
-    regions = Regions(cells, features, error_rate)
+    regions = Regions(cells, features, error_rate, _sharing(result))
     pairs = region_merging.neighbours(cells)
     regions.join_alike(pairs, resolution)
     # Pairs whose ratios could not show a difference are compared by what they emit.
@@ -169,7 +170,7 @@ def without_borders(labels: xr.DataArray, result: xr.Dataset, response: xr.Datas
     ratios, _ = _features(result, _bands(result, response)[0])
     cells = np.asarray(labels.values + 1, dtype=np.intp)
     every = np.arange(cells.max() + 1)[np.newaxis]
-    pooled = Regions(cells, ratios, _ERROR_RATE).pooled(every)
+    pooled = Regions(cells, ratios, _ERROR_RATE, _sharing(result)).pooled(every)
     means, variances, stated = (array[:, 0] for array in pooled)
 
     def distance(regions: Labels) -> Array:
@@ -263,6 +264,11 @@ def _bands(result: xr.Dataset, response: xr.Dataset) -> tuple[list[int], Array]:
     noise = result["noise"].values / slopes
     bands = [int(band) for band in np.argsort(noise, kind="stable")]
     return bands, noise[bands]
+
+
+def _sharing(result: xr.Dataset) -> float:
+    """Number of pixels that share an error of their ratios, as those of bands that are blurred."""
+    return float(result["reflection_ratio_std"].attrs.get("pixels", 1.0))
 
 
 def _features(result: xr.Dataset, bands: list[int]) -> tuple[Features, Features]:

@@ -81,11 +81,16 @@ class Regions:
 
     is chi-square over the features that both have, if they are of one material. Its limit is passed
     with a probability of the error rate over three times the number of cells, than which a map has
-    fewer borders. The first feature is the one whose differences must be resolved.
+    fewer borders. The first feature is the one whose differences must be resolved. So many pixels
+    share an error of a feature that is not common to all.
     """
 
-    def __init__(self, cells: Labels, features: Features, error_rate: float) -> None:
+    def __init__(
+        self, cells: Labels, features: Features, error_rate: float, share: float = 1.0
+    ) -> None:
         self._total, self._first, _, self._count = features.sums(cells)
+        for sums in (self._total, self._first):
+            sums[~features.common] /= share
         self._common = features.common[:, np.newaxis, np.newaxis]
         self._tolerance = features.tolerance[:, np.newaxis]
         freedom = np.arange(features.common.size + 1)
