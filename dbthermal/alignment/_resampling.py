@@ -7,7 +7,7 @@ import numpy as np
 import xarray as xr
 
 from dbthermal import _numbers, _rows, schema
-from dbthermal._arrays import Array, Mask
+from dbthermal._arrays import Array
 from dbthermal._warnings import warned
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment import _views as views
@@ -47,7 +47,11 @@ def on_one_clock(
     reference = int(np.argmax(relative)) if clock is None else names.index(clock)
     times, segment = clocks.fill_times(stamps[reference]), schema.segments(corrected)
     # Plan the interpolation of each band, and how it reduces noise.
-    plans, factors, missing = [], np.ones(len(names)), _missing(counts)
+    plans, factors = [], np.ones(len(names))
+    # Frames that are NaN, or a copy of the one before, in every block of rows.
+    blocks = (counts.isel(y=rows).values for rows in _rows.blocks(counts.shape))
+    copies = [[clocks.missing(views.single(film)) for film in block] for block in blocks]
+    missing = np.all(copies, axis=0)
     for band, (row, absent) in enumerate(zip(stamps, missing, strict=True)):
         plan = clocks.interpolation(row, ~absent, times, segment, clocks.growth(signals[band]))
         plans.append(replace(plan, valid=plan.valid & (plan.labels(segment) == segment)))
@@ -104,15 +108,6 @@ def _offsets(
         rule = f"Must be finite, and 0 in band '{names[0]}', the first"
         raise ValueError(f"Invalid offset {values.tolist()} s. {rule}.")
     return values
-
-
-def _missing(films: xr.DataArray) -> Mask:
-    """Frames (band, time) that are NaN, or a copy of the one before, in every block of rows."""
-    blocks = [
-        [clocks.missing(views.single(movie)) for movie in films.isel(y=rows).values]
-        for rows in _rows.blocks(films.shape)
-    ]
-    return np.asarray(np.all(blocks, axis=0))
 
 
 def _assembled(corrected: xr.Dataset, aligned: xr.DataArray, times: Array) -> xr.Dataset:

@@ -79,8 +79,8 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     with the shift between the cameras' reflections (`alignment.reflection_shift`); then with the
     pixels of each material pooled (`materials`), held to what they tell alone; last, what is still
     unknown is completed (`complete`). Before that, what the model leaves in the bands widens the
-    deviations; if the bands' images lie off each other, the cameras shake, or the bands are not
-    equally sharp, that is mended first.
+    deviations; if the bands' images lie off each other, their clocks differ, the cameras shake, or
+    the bands are not equally sharp, that is mended first.
 
     Parameters
     ----------
@@ -237,7 +237,7 @@ def _mended(
         retry = None if steady is None else once(steady.capture)
         if steady is None or retry is None:
             break
-        undone = _measured(retry[0]) >= _KEPT * _measured(measured)
+        undone = retry[0].sound >= _KEPT * measured.sound
         if undone or retry[1].size < misfit.size:  # else what changes is no motion
             sentences = [steady.sentence(undone=undone)]
         if not undone:
@@ -249,7 +249,7 @@ def _mended(
     outcome = measured, misfit
     alike = equalise(capture, measured.inputs, measured.result, misfit)
     retry = None if alike is None else once(alike.capture)
-    if alike and retry and _measured(retry[0]) > _KEPT * _measured(measured):
+    if alike and retry and retry[0].sound > _KEPT * measured.sound:
         measured, less = retry
         # Noise that is not white is told before: a blur takes rapid noise alone.
         detail = np.hypot(left, alike.detail)
@@ -257,11 +257,6 @@ def _mended(
         capture, outcome = alike.capture, (measured, less)
         sentences.append(alike.sentence)
     return capture, outcome, late + sentences
-
-
-def _measured(measured: "Measured") -> int:
-    """Number of pixels without a flag."""
-    return int(np.count_nonzero(measured.result["status"].values == 0))
 
 
 @dataclass(frozen=True)
@@ -273,6 +268,11 @@ class Measured:
     materials: xr.DataArray | None
     reflection_shift: xr.Dataset | None
     doubts: list[str]
+
+    @property
+    def sound(self) -> int:
+        """Number of pixels without a flag."""
+        return int(np.count_nonzero(self.result["status"].values == 0))
 
     @property
     def asynchronous(self) -> float:

@@ -337,7 +337,12 @@ def _separate(
                 survey.replace_pixels(cut.places[pixels], section)
         if result is not None:
             _write(result, inputs.bands, cut, estimates)
-            _keep(inputs.division, cut.places, estimates)
+            # The divisions of the time of pixels with all frames are kept for the next pass.
+            inputs.division[:, cut.places] = 0
+            for frames, pixels, estimate in estimates:
+                if estimate.division is not None and np.all(frames):
+                    kept = np.packbits(estimate.division, axis=0)
+                    inputs.division[:, cut.places[pixels]] = kept
         release()
         size += cut.status.size
     return size
@@ -362,16 +367,6 @@ def separated_dataset(
     if _COVARIANCE in arrays:
         coordinates["other_band"] = capture["band"].rename(band="other_band")
     return xr.Dataset(variables, coordinates, kept)
-
-
-def _keep(
-    division: npt.NDArray[np.uint8], places: Whole, estimates: list[tuple[Mask, Mask, Estimate]]
-) -> None:
-    """Keep the divisions of the time of pixels with all frames for the next pass, in place."""
-    division[:, places] = 0
-    for frames, pixels, estimate in estimates:
-        if estimate.division is not None and np.all(frames):
-            division[:, places[pixels]] = np.packbits(estimate.division, axis=0)
 
 
 @np.errstate(over="ignore")  # a deviation beyond single precision is infinite

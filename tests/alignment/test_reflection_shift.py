@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from worlds import RESPONSE as WORLD
+from worlds import World, seen
 
 from dbthermal import alignment, schema, simulation, store
 from reproduction import disturbances, twins
@@ -57,6 +59,17 @@ def test_finds_a_smooth_field() -> None:
     field = check(capture, true, 0.8, 0.03)
     assert field.attrs["reference_band"] == "8-14"
     assert field.attrs["bands"] == ["9.5"]
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_border_of_the_image(seed: int) -> None:
+    """Near the border, too, the field along the baseline is right to hundredths of a pixel."""
+    shift = alignment.reflection_shift(seen(World(parallax=2.0), seed)[0], WORLD)
+    inner, known = np.zeros(shift["known"].shape, dtype=bool), shift["known"].values
+    inner[6:-6, 6:-6] = True
+    error = (np.abs(shift["shift"].sel(axis="x").values) - 2.0)[known & ~inner]
+    print(f"{np.sqrt(np.mean(error**2)):.3f} pixel off at the border")
+    assert np.sqrt(np.mean(error**2)) < 0.03
 
 
 def test_parts_that_are_late_differently_make_the_delay_uncertain() -> None:

@@ -8,6 +8,7 @@ import pytest
 import xarray as xr
 from captures import emissivity_of
 from scenes import held
+from worlds import RESPONSE, World, seen
 
 from dbthermal import separation, simulation
 from dbthermal.schema import Status
@@ -136,3 +137,21 @@ def test_memory_is_that_of_the_frames() -> None:
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert max(peaks) < 1.5 * peaks[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("lag", "parallax"), [(0.05, 0.0), (0.14, 0.0), (0.14, 2.0)])
+def test_clocks_that_differ_are_undone(lag: float, parallax: float) -> None:
+    """Cameras at one place or apart, whose clocks differ by a part of a frame or more."""
+    capture, truth = seen(World(lag=lag, parallax=parallax), 2)
+    with pytest.warns(UserWarning, match="The clocks differ") as said:
+        result = separation.separate(capture, RESPONSE)
+    (found,) = (text for text in map(str, (it.message for it in said)) if "clocks" in text)
+    assert float(found.split("taken ")[1].split(" s")[0]) == pytest.approx(lag, abs=0.002)
+    np.testing.assert_array_equal(result["time"], capture["time"])
+    sound = result["status"].values == 0
+    error = np.abs(result["object_temperature"].values - truth)[:, sound]
+    holds = np.nanmean(error < 1.96 * result["object_temperature_std"].values[:, sound])
+    print(f"{holds:.3f} of the intervals hold, {sound.mean():.3f} without a flag")
+    assert sound.mean() > 0.9
+    assert holds > 0.92

@@ -9,6 +9,7 @@ import xarray as xr
 from captures import emissivity_of
 from scenes import GLASS, RIG, field, judged, painted
 from scipy.sparse import csr_array
+from worlds import MARGIN, RESPONSE, SHAPE, World, seen
 
 from dbthermal import alignment, separation, simulation
 from dbthermal.schema import Status
@@ -18,6 +19,36 @@ from reproduction.experiments.pictures import Picture, smooth_shift
 TIME = np.arange(300) / 10.0
 SMALL = Picture(shape=(20, 48), walkers=6)
 STRAIGHT = smooth_shift(SMALL.shape, 2.5, 0.0)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_responses_over_a_wide_range_are_followed(seed: int) -> None:
+    """Of quiet cameras the ratio of a material is within its deviations, over 160 K."""
+    quiet = simulation.Rig(noise=(0.003, 0.005), lowest=263.15, highest=423.15)
+    scene = painted(seed, picture=SMALL, time=TIME, shift=STRAIGHT, rig=quiet)
+    one_material = xr.DataArray(np.zeros(SMALL.shape, dtype=np.int32), dims=("y", "x"))
+    result = separation.solve(
+        scene.capture, scene.response, reflection_shift=field(STRAIGHT), pool=one_material
+    )
+    ratio, std = (result[f"reflection_ratio{end}"][1].median().item() for end in ("", "_std"))
+    true = (1.0 - GLASS[1]) / (1.0 - GLASS[0])
+    print(f"ratio {ratio / true - 1.0:+.4%} off, deviation {std / true:.4%}")
+    assert abs(ratio - true) < 3.0 * std
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_border_of_materials(seed: int) -> None:
+    """Pixels that mix two materials, one in each camera, are right within their bars."""
+    capture, truth = seen(World(parallax=2.0), seed)
+    result = separation.separate(capture, RESPONSE)
+    row, column = np.indices(SHAPE) + MARGIN
+    border = 0.55 * (SHAPE[1] + 2 * MARGIN) + 3.0 * np.sin(row / 9.0)
+    near = (np.abs(column - border) < 5.0) & (result["status"].values == 0)
+    error = np.abs(result["object_temperature"].values - truth)[:, near]
+    holds = np.mean(error < 1.96 * result["object_temperature_std"].values[:, near])
+    print(f"{holds:.3f} of the intervals hold, of {near.sum()} pixels")
+    assert near.sum() > 380
+    assert holds > 0.92
 
 
 def test_bad_pixels_cost_no_more_than_their_surroundings() -> None:

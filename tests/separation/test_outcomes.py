@@ -56,7 +56,6 @@ BOUNDS: Final[dict[str, Bounds]] = {
     "swapped order": Bounds(0.95, 0.142, emissivity=0.003, p90=0.15),
     "three bands": Bounds(0.96, 0.055, emissivity=0.002, p90=0.057),
     "shutter events": Bounds(0.97, 0.155, emissivity=0.009, p90=0.245),
-    # In one call a delay is taken for a shift: of some seeds without a warning.
     "two frames late": Bounds(0.98, 0.06, p90=0.1, shift="none", said="The clocks differ"),
     "uneven times": Bounds(0.93, 0.065, emissivity=0.003, p90=0.084),
     # More of a drift than the prior's, along the object's curve: emissivities are 0.08 off.
@@ -83,7 +82,6 @@ BOUNDS: Final[dict[str, Bounds]] = {
 }
 # Bounds that are missed since the ratios of cameras apart are those of maps.
 MISSED: Final = {
-    "slow, apart": "emissivity 0.027 off: the ratio is that of rapid changes alone",
     "rapid, nearly black, apart": "measured 0.20, and a warning: flags of a first pass are lost",
 }
 SLOW: Final = {

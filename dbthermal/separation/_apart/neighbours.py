@@ -46,11 +46,9 @@ BLURS: Final = (0.0, BLUR, 2.0 * BLUR)
 _WIDE: Final = 6.0
 # Windows along the image's smaller side, and how many of a material have a jackknife.
 _ALONG, _FEWEST = 4, 3
-# Chance that a blur changes the ratio of a pixel inside of a material so much [1]: at 6e-5 half of
-# the pixels at borders are not seen, and those are 0.1 to 0.5 K off; one that is wrongly taken for
-# one loses only the precision of those around.
-_MIXED: Final = 0.01
-_TOGETHER: Final = 3  # of such pixels side by side: alone it may be beside a bad one
+# Chance that a blur changes the ratio of a pixel inside a material so much [1], and how many pixels
+# lie so side by side at a border: at 6e-5 half of those there were missed, 0.1 to 0.5 K off.
+_MIXED, _TOGETHER = 0.01, 3
 # Share of a neighbourhood that tells the ratio of a pixel which does not, at least [1].
 _SOME: Final = 0.1
 # Deviation of the neighbourhood that tells an emissivity, over the image's smaller side.

@@ -141,10 +141,10 @@ def materials(
         corrected, result = corrected.isel(time=frames), result.isel(time=frames)
     bands, noise = _bands(result, response)
     means, variances, change = feature_maps.mean_signals(corrected, response, bands, noise)
-    ratios, features = _features(result, bands)
+    (ratios, features), share = _features(result, bands), _sharing(result)
     valid = np.all(np.isfinite(means), axis=0) & (result["status"].values & int(_UNUSABLE) == 0)
     cells = _cells(ratios, means, variances, valid, error_rate)
-    regions = Regions(cells, features, error_rate, _sharing(result))
+    regions = Regions(cells, features, error_rate, share)
     pairs = region_merging.neighbours(cells)
     regions.join_alike(pairs, resolution)
     # Pairs whose ratios could not show a difference are compared by what they emit.
