@@ -36,7 +36,7 @@ from dbthermal.separation._apart.planes import Planes
 from dbthermal.separation._apart.relaxation import Floats
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._subspace import regression
-from dbthermal.separation._subspace.reflection_ratio import null_combination, ratio_variance
+from dbthermal.separation._subspace.reflection_ratio import null_combination
 from dbthermal.separation._tiles import USELESS, Mask, Material, Whole
 
 _OBJECT: Final = ("object_temperature", "object_temperature_std")
@@ -299,8 +299,9 @@ def _by_maps(
     combined, variance = maps.combined(weights, places)
     if material is not None:
         std = result["reflection_ratio_std"].values[inputs.bands].reshape(len(noise), -1)[:, places]
-        inverse = material.inverse_energy[places]
-        std = np.where(np.isnan(inverse), std, np.sqrt(ratio_variance(ratio, inverse, noise)))
+        size = np.sqrt(noise[:, np.newaxis] ** 2 + (ratio * noise[0]) ** 2)  # eq. 4
+        pooled = np.sqrt(material.inverse_energy[places]) * size
+        std = np.where(np.isnan(pooled), std, pooled)
         off = ratio + np.where(np.isnan(material.emissivity[places]), np.nan_to_num(std), 0.0)
         off[0] = 1.0
         change, _ = maps.combined(null_combination(off, noise)[0] - weights, places)

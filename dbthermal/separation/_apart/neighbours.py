@@ -85,8 +85,7 @@ def ratios(inputs: Inputs, planes: Planes, status: Bits) -> Material:
     square = (ratio - middle) ** 2
     chi = neighbour_mean((square * weight)[1:].mean(axis=0), sound, _WIDE)
     between = neighbour_mean(square, weight, _WIDE)
-    surrounded = gaussian_filter(sound * 1.0, _WIDE, mode="constant") > _SOME
-    cases = [mixed, sound, moving & surrounded]
+    cases = [mixed, sound, moving & (gaussian_filter(sound * 1.0, _WIDE, mode="constant") > _SOME)]
     ratio = np.select(cases, [border, ratio, middle], np.nan)
     variance = np.select(cases, [of_border * usual, variance * np.maximum(chi, 1.0), between])
     ratio, variance = (values.reshape(len(noise), -1) for values in (ratio, variance))
