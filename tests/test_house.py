@@ -12,7 +12,7 @@ HOUSE = Path(dbthermal.__file__).parent
 BUDGET = {
     "": (3491, 18),
     "_cli": (1224, 5),
-    "alignment": (2891, 13),
+    "alignment": (2890, 13),
     "calibration": (799, 3),
     "correction": (1754, 7),
     "emissivity": (448, 3),
@@ -22,7 +22,7 @@ BUDGET = {
     "limits": (732, 4),
     "readers": (2691, 12),
     "reporting": (404, 2),
-    "separation": (13004, 54),
+    "separation": (13005, 54),
     "simulation": (570, 3),
     "store": (1410, 6),
 }

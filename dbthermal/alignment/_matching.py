@@ -90,10 +90,9 @@ class Movies:
         """
         pixels, shape = np.indices(self.valid.shape), np.reshape(self.valid.shape, (2, 1, 1))
         places = pixels + shift / self.factor
-        used = inside(places, self.valid) & self.valid
-        for each in (pixels, places):
-            used &= np.all((each >= _MIRRORED) & (each <= shape - 1 - _MIRRORED), axis=0)
-        return places, used
+        grids = np.stack([pixels, places])
+        inner = (grids >= _MIRRORED) & (grids <= shape - 1 - _MIRRORED)
+        return places, inside(places, self.valid) & self.valid & np.all(inner, axis=(0, 1))
 
 
 def _whole_pixels(

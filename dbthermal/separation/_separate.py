@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Final
+from warnings import catch_warnings
 
 import numpy as np
 import xarray as xr
@@ -194,33 +195,33 @@ def _on_one_clock(
     much the object (y, x) [K] hangs on which of the clocks that is.
     """
     outcome = once(capture)
+    unchanged = capture, outcome, list[str](), 0.0
     names, share = capture["band"].values.tolist(), outcome[0].asynchronous
     if share <= _SOME:
-        return capture, outcome, [], 0.0
+        return unchanged
     try:
-        aligned = alignment.align(capture, clock=names[0])
+        with catch_warnings(record=True) as notes:  # said only if its clocks are taken
+            aligned = alignment.align(capture, clock=names[0])
     except ValueError:  # nothing tells the clocks: the pixels keep the flag
-        return capture, outcome, [], 0.0
+        return unchanged
     times, aligned = aligned["time"], aligned.assign_coords(time=capture["time"])
     retry = once(aligned)
     if not retry[0].asynchronous < _LESS * share:
-        return capture, outcome, [], 0.0
+        return unchanged
     offsets, std = np.array(aligned.attrs["time_offset"]), aligned.attrs.get("time_offset_std")
-    late = names[np.abs(offsets).argmax()]
+    place = int(np.abs(offsets).argmax())
     detail: Array | float = 0.0
     if np.any(aligned["noise_factor"] < schema.noise_factor(capture)):
         # Between frames the rapid changes of the band that is interpolated are too small.
         offset = xr.DataArray(offsets, {"band": names}, "band")
-        second = once(alignment.align(capture, offset=offset, clock=late))[0].result
+        second = once(alignment.align(capture, offset=offset, clock=names[place]))[0].result
         films = [result["object_temperature"] for result in (retry[0].result, second)]
         change = films[1].interp(time=times) - films[0].values
         detail = np.nan_to_num(0.5 * np.sqrt((change**2).mean("time").values))
     known = "" if std is None else f", known to {std:.4f} s"
-    sentence = (
-        f"The clocks differ: band '{late}' was taken {offsets[np.abs(offsets).argmax()]:+.4f} s "
-        f"after '{names[0]}'{known}, and was interpolated."
-    )
-    return aligned, retry, [sentence], detail
+    sentence = f"The clocks differ: band '{names[place]}' was taken {offsets[place]:+.4f} s after "
+    sentence += f"'{names[0]}'{known}, and was interpolated."
+    return aligned, retry, [*(str(note.message) for note in notes), sentence], detail
 
 
 def _mended(
@@ -230,7 +231,7 @@ def _mended(
 
     Returns the capture as mended, what was measured and what is left, and what was done.
     """
-    original, (measured, misfit), late, left = _on_one_clock(original, once)
+    original, (measured, misfit), late, remainder = _on_one_clock(original, once)
     capture, motion, sentences = original, None, list[str]()
     for _ in range(_ROUNDS):
         steady = stabilise(original, measured.inputs, measured.result, misfit, motion)
@@ -244,15 +245,15 @@ def _mended(
             break
         capture, motion = steady.capture, steady.motion
         measured, misfit = retry
-        left = np.hypot(left, steady.detail(measured.inputs, measured.result))
-    misfit = replace(misfit, change=np.hypot(misfit.change, left))
+        remainder = np.hypot(remainder, steady.detail(measured.inputs, measured.result))
+    misfit = replace(misfit, change=np.hypot(misfit.change, remainder))
     outcome = measured, misfit
     alike = equalise(capture, measured.inputs, measured.result, misfit)
     retry = None if alike is None else once(alike.capture)
     if alike and retry and retry[0].sound > _KEPT * measured.sound:
         measured, less = retry
         # Noise that is not white is told before: a blur takes rapid noise alone.
-        detail = np.hypot(left, alike.detail)
+        detail = np.hypot(remainder, alike.detail)
         less = replace(less, change=np.hypot(less.change, detail), single=misfit.single)
         capture, outcome = alike.capture, (measured, less)
         sentences.append(alike.sentence)

@@ -441,8 +441,8 @@ def _factor(
     settled = power < _GROWN * size[:, 0] ** 2  # elsewhere the iteration grows
     # Over a few pixels: neighbours have nearly the same, and the draws are few.
     powers = np.where(settled, [power, size[:, 0] ** 2], 0.0).reshape(2, *displacement.shape)
-    around, single = convolve(powers, np.ones((1, 3, 3))).reshape(2, -1), powers.reshape(2, -1)
-    factor, lone = (energy / np.where(settled, total, np.nan) for energy, total in (around, single))
-    # Not beside one that is far less certain, whose error it has a part of.
-    factor = np.where(lone > (1.0 + 3.0 * np.sqrt(2.0 / _DRAWS)) * factor, lone, factor)
+    sums, pixels = convolve(powers, np.ones((1, 3, 3))).reshape(2, -1), powers.reshape(2, -1)
+    factor, sharp = (energy / np.where(settled, total, np.nan) for energy, total in (sums, pixels))
+    # Not beside a pixel that is far less certain, whose error has a share in this.
+    factor = np.where(sharp > (1.0 + 3.0 * np.sqrt(2.0 / _DRAWS)) * factor, sharp, factor)
     return np.where(sized, factor, 1.0)
