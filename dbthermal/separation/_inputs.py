@@ -99,7 +99,7 @@ class Inputs:
     labels: Labels | None  # material of each pixel, numbered from 0, -1 for none (pixel)
     displacement: Displacement | None  # of the second camera's reflections
     division: npt.NDArray[np.uint8]  # of the time, by the pass before, packed (frame / 8, pixel)
-    difference: Callable[[slice, slice | Labels], npt.NDArray[Any]] | None = None  # `joint.Joint`
+    difference: Callable[[Labels], npt.NDArray[Any]] | None = None  # `joint.Joint`
 
     @property
     def good(self) -> Mask:

@@ -150,7 +150,7 @@ def frame_sets(valid: Mask, status: Bits) -> Iterator[tuple[Mask, Mask]]:
     usable = ~unusable(status)
     if not np.any(usable):
         return
-    if np.all(valid[:, usable]):
+    if np.all(valid | ~usable):
         yield np.ones(valid.shape[0], dtype=bool), usable
         return
     packed = np.packbits(valid, axis=0)

@@ -330,9 +330,9 @@ def _separate(
                 estimate = estimate.select_pixels(pixels)
             estimates.append((frames, pixels, estimate))
             if estimate.survey is not None:
-                # Whitened by one noise for all, not by that of the tile.
-                scale = np.array(tile.noise) / inputs.noise[inputs.bands]
-                scatter = estimate.survey.scatter * np.multiply.outer(scale, scale)[..., np.newaxis]
+                # Whitened by one noise for all, not by that of the pixel.
+                scale = tile.scaled(tile.noise) / inputs.noise[inputs.bands][:, np.newaxis]
+                scatter = estimate.survey.scatter * (scale[:, np.newaxis] * scale)
                 section = replace(estimate.survey, scatter=scatter)
                 survey.replace_pixels(cut.places[pixels], section)
         if result is not None:
@@ -389,7 +389,8 @@ def _write(
         if name == "status":
             target[...] = cut.status.reshape(shape)
         elif unestimated.any():
-            target[..., unestimated.reshape(shape)] = np.nan
+            y, x = np.divmod(np.flatnonzero(unestimated), shape[1])
+            target[..., y, x] = np.nan
         for frames, pixels, estimate in estimates:
             values, places = getattr(estimate, name), pixels.reshape(shape)
             if values is None:
@@ -401,21 +402,26 @@ def _write(
             elif complete and np.all(frames) and np.all(pixels):
                 target[...] = values.reshape(target.shape)
             else:
-                values, places = np.asarray(values, np.float32), np.flatnonzero(pixels)
-                _scatter(values, frames, places, cut.valid, target)
+                values, selected = np.asarray(values, np.float32), np.flatnonzero(pixels)
+                _scatter(values, frames, selected, np.divmod(selected, shape[1]), cut.valid, target)
 
 
 @compiled
 def _scatter(
-    values: npt.NDArray[np.float32], frames: Mask, places: Whole, valid: Mask, film: Any
+    values: npt.NDArray[np.float32],
+    frames: Mask,
+    pixels: Whole,
+    places: tuple[Whole, Whole],
+    valid: Mask,
+    film: Any,
 ) -> None:
-    """Write values (time, pixel) at some frames and places of a film (time, y, x), in place.
+    """Write values (time, pixel) of some frames and pixels into a film (time, y, x), in place.
 
     NaN at its other frames, and at samples (time, pixel) that are not valid.
     """
-    row, width = 0, film.shape[2]
+    row, (y, x) = 0, places
     for t in range(frames.size):
-        for p in range(places.size):
-            measured = frames[t] and valid[t, places[p]]
-            film[t, places[p] // width, places[p] % width] = values[row, p] if measured else np.nan
+        for p in range(pixels.size):
+            measured = frames[t] and valid[t, pixels[p]]
+            film[t, y[p], x[p]] = values[row, p] if measured else np.nan
         row += frames[t]

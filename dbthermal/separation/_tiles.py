@@ -29,6 +29,8 @@ Whole = npt.NDArray[np.intp]
 Mask = npt.NDArray[np.bool_]
 Window = tuple[slice, slice]
 """Rows and columns of a tile in the image."""
+Part = tuple[Window, Whole, slice, slice | Whole]
+"""A window, and its pixels: numbers in the image, places among those read, and in the window."""
 
 KEPT_ATTRS: Final = ("origin", "radiometric", "source", "twin")
 """Attributes of a capture that its result has, too."""
@@ -119,6 +121,7 @@ class Tile:
     shape: tuple[int, int]  # rows and columns; pixels follow one another along the rows
     rng: np.random.Generator  # the tile's own source of random starts
     pattern: tuple[float, ...] = ()  # residual fixed pattern of each band [K], empty without
+    gain: Array | None = None  # noise of the bands after the first over that (pixel) [1]
     segment: Whole | None = None  # number of shutter events before each frame (time,)
     material: Material | None = None
     emissivity: Array | None = None  # known beforehand (band, pixel) [1]
@@ -139,6 +142,13 @@ class Tile:
         """Temperature [K] of the blackbody with a signal [K]; NaN where undefined."""
         return self.curves[band].temperature(signal + self.reference)
 
+    def scaled(self, stds: tuple[float, ...]) -> Array:
+        """Standard deviations (band, pixel) [K] of each pixel, of those of the bands."""
+        result = np.repeat(np.array(stds)[:, np.newaxis], self.signals.shape[2], axis=1)
+        if self.gain is not None:
+            result[1:] *= self.gain
+        return result
+
     def mixed(self, emissivity: Array, temperatures: Array) -> Array:
         """Signals (band, time, pixel) [K] of object and background (2, time, pixel) [K]."""
         signals = []
@@ -154,7 +164,7 @@ class Tile:
 
     def select_pixels(self, selected: Mask | Whole) -> "Tile":
         """Return the tile of the selected pixels (pixel) alone, as one row."""
-        names = "signals", "emissivity", "emissivity_covariance", "division"
+        names = "signals", "gain", "emissivity", "emissivity_covariance", "division"
         present = {name: vars(self)[name] for name in names if vars(self)[name] is not None}
         arrays: dict[str, Any] = {name: select(present[name], selected) for name in present}
         material = None if self.material is None else self.material.select_pixels(selected)
@@ -242,13 +252,14 @@ class Cut:
     parts: list[Section]
 
 
-def windows(rows: slice, width: int, pixels: int) -> Iterator[Window]:
-    """Yield windows of at most so many pixels that cover some rows of an image."""
-    columns = min(width, pixels)
-    height = max(1, pixels // columns)
+def windows(rows: slice, columns: slice, pixels: int) -> Iterator[Window]:
+    """Yield windows of at most so many pixels that cover some rows and columns of an image."""
+    width = min(columns.stop - columns.start, pixels)
+    height = max(1, pixels // width)
     for top in range(rows.start, rows.stop, height):
-        for left in range(0, width, columns):
-            yield slice(top, min(top + height, rows.stop)), slice(left, min(left + columns, width))
+        for left in range(columns.start, columns.stop, width):
+            lines = slice(top, min(top + height, rows.stop))
+            yield lines, slice(left, min(left + width, columns.stop))
 
 
 def largest(method: Method, settings: Any, capture: xr.Dataset) -> int:
@@ -271,39 +282,64 @@ def cut(
     most = largest(method, inputs.settings, inputs.capture)
     size = most if displacement is None else max(width, _TOGETHER // frames)
     size = (rows.stop - rows.start) * width if method.whole_image else size
-    # Read each window, judge its samples, and group its pixels by their valid frames.
-    for window in windows(rows, width, size):
-        lines, columns = (np.arange(span.start, span.stop) for span in window)
-        places = np.add.outer(lines * width, columns).ravel()
-        selected = slice(None) if wanted is None else np.flatnonzero(wanted[places])
-        places = places[selected]
-        if places.size == 0:
+    for window in windows(rows, slice(0, width), size):
+        selected, parts = _parts(window, width, most if method.compiled else size, wanted)
+        if not parts:
             continue
+        # Read the pixels together; judge the samples, and group the pixels by valid frames.
         counts, usable, valid, status, gain = sampled(window, selected)
-        if method.whole_image or method.every_frame:
-            sets = quality.common_frames(counts, usable, status, method.minimum_frames)
-        else:
-            sets = list(quality.frame_sets(usable, status))
-        packed = inputs.division[:, places]
-        division = np.unpackbits(packed, axis=0, count=frames).view(bool) if packed.any() else None
-        tile = replace(
-            _tile(inputs, counts, window, selected),
-            surveyed=displacement is None or wanted is not None,
-            division=division,
-            material=None if material is None else material.select_pixels(places),
-        )
-        if inputs.difference is not None:
-            tile.signals[1:] -= inputs.difference(window[0], selected)
-        sections = list[Section]()
-        for used, pixels in sets:  # of which there may be many, each of few pixels
-            whole = method.whole_image or np.all(pixels)
-            section = tile if whole else tile.select_pixels(pixels)
-            section = section if np.all(used) else section.select_frames(used)
-            if displacement is None:
-                sections.append((used, pixels, section))
+        for part, places, within, chosen in parts:
+            # A tile's own samples lie together: rows of a large film are far apart in memory.
+            signals = np.ascontiguousarray(counts[..., within])
+            bridged, flags = np.ascontiguousarray(usable[:, within]), status[within]
+            if method.whole_image or method.every_frame:
+                sets = quality.common_frames(signals, bridged, flags, method.minimum_frames)
             else:
-                sections.extend(of_one_noise(used, pixels, section, gain, most))
-        yield Cut(window, places, status, valid, sections)
+                sets = list(quality.frame_sets(bridged, flags))
+            packed = inputs.division[:, places]
+            division = np.unpackbits(packed, axis=0, count=frames).view(bool)
+            tile = replace(
+                _tile(inputs, signals, part, chosen),
+                surveyed=displacement is None or wanted is not None,
+                gain=gain[1, within] if displacement is not None and method.compiled else None,
+                division=division if packed.any() else None,
+                material=None if material is None else material.select_pixels(places),
+            )
+            if inputs.difference is not None:
+                tile.signals[1:] -= inputs.difference(places)
+            sections = list[Section]()
+            for used, pixels in sets:  # of which there may be many, each of few pixels
+                whole = method.whole_image or np.all(pixels)
+                section = tile if whole else tile.select_pixels(pixels)
+                section = section if np.all(used) else section.select_frames(used)
+                if displacement is None or method.compiled:
+                    sections.append((used, pixels, section))
+                else:
+                    sections.extend(of_one_noise(used, pixels, section, gain[1], most))
+            yield Cut(part, places, flags, valid[:, within], sections)
+
+
+def _parts(
+    window: Window, width: int, pixels: int, wanted: Mask | None
+) -> tuple[slice | Whole, list[Part]]:
+    """Pixels of a window that are wanted, and parts of at most so many of them."""
+    if wanted is None:
+        parts, start = list[Part](), 0
+        for part in windows(*window, pixels):
+            places = _numbers(part, width)
+            parts.append((part, places, slice(start, start + places.size), slice(None)))
+            start += places.size
+        return slice(None), parts
+    places = _numbers(window, width)
+    selected = np.flatnonzero(wanted[places])
+    spans = [slice(start, start + pixels) for start in range(0, selected.size, pixels)]
+    return selected, [(window, places[selected[span]], span, selected[span]) for span in spans]
+
+
+def _numbers(window: Window, width: int) -> Whole:
+    """Numbers of the pixels of a window in the image."""
+    lines, columns = (np.arange(span.start, span.stop) for span in window)
+    return np.add.outer(lines * width, columns).ravel()
 
 
 def read(inputs: Inputs, rows: slice) -> tuple[Array, Mask, Mask, Array]:
@@ -388,15 +424,14 @@ def of_one_noise(
 
     A residual pattern is independent from pixel to pixel, and is scaled like the noise.
     """
-    order = np.rint(np.log(gain[1, pixels]) / _NOISE_STEP).astype(np.intp)
+    order = np.rint(np.log(gain[pixels]) / _NOISE_STEP).astype(np.intp)
     for level in np.unique(order):
         alike = np.flatnonzero(order == level)
         for start in range(0, alike.size, most):
             chosen = alike[start : start + most]
             group = np.zeros_like(pixels)
             group[np.flatnonzero(pixels)[chosen]] = True
-            factor = np.exp(np.log(gain[:, group]).mean(axis=1))
-            factors = np.append(factor[0], np.repeat(factor[1], len(tile.noise) - 1))
+            factors = np.append(1.0, [np.exp(np.log(gain[group]).mean())] * (len(tile.noise) - 1))
             noise, pattern = (tuple(factors * stds) for stds in (tile.noise, tile.pattern))
             single = replace(tile.select_pixels(chosen), noise=noise, pattern=pattern)
             yield frames, group, single

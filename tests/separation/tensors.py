@@ -40,7 +40,9 @@ def solve(device: str, tile: Tile, functions: smooth.Subspace, drift: float) -> 
     def tensor(values: Any) -> Any:
         return torch.tensor(values, device=device) if isinstance(values, np.ndarray) else values
 
-    model = pixel.Model(*map(tensor, fused.share(tile, functions, drift)))
+    shared = fused.share(tile, functions, drift)._asdict()
+    shared |= {"noise": np.array(tile.noise), "pattern": np.array(tile.pattern or [0.0, 0.0])}
+    model = SimpleNamespace(**{name: tensor(values) for name, values in shared.items()})
     material = {} if tile.material is None else vars(tile.material)
     material = {name: tensor(values) for name, values in material.items()}
     signals = tensor(tile.signals)

@@ -44,7 +44,7 @@ _KEPT: Final = 2**29
 
 
 T = TypeVar("T")
-Paired: TypeAlias = tuple[Array, Mask, Mask, Bits, Array]
+Paired: TypeAlias = tuple[npt.NDArray[Any], Mask, Mask, Bits, Array]
 """Counts, samples valid or bridged, those that are valid, status, and noise: see `read`."""
 
 
@@ -185,7 +185,7 @@ def paired(
 ) -> Paired:
     """Some pixels of some rows as `read`, their short gaps bridged; kept for the next time.
 
-    The source is read if they are not kept; only those of a small capture are.
+    In single precision. The source is read if they are not kept; only those of a small capture are.
     """
     films, every = displacement.read, (rows.start, rows.stop, b"")
     chosen = every if isinstance(selected, slice) else (*every[:2], selected.tobytes())
@@ -195,17 +195,17 @@ def paired(
             block, grains = load()
             counts, valid, status, gain = read(block, displacement, rows, source, fewest, grains)
             counts, usable = quality.bridge(counts, valid, block["time"].values.astype(np.float64))
-            reading = counts, usable, valid, status, gain
+            reading = counts.astype(np.float32), usable, valid, status, gain
         share = (rows.stop - rows.start) / displacement.shape[0]
         if chosen != every:
             share, reading = 1.0, tuple(select(film, selected) for film in reading)
         groups = reading, chain(*films.values())
         size, held = (sum(film.nbytes for film in group) for group in groups)
         if size + held > _KEPT or (share < 1.0 and size > 0.5 * share * _KEPT):
-            return reading
+            films = {chosen: reading}
         films[chosen] = reading
     counts, usable, valid, status, gain = films[chosen]  # the tile is made of them, in place
-    return counts.copy(), usable, valid, status.copy(), gain
+    return counts.astype(np.float64), usable, valid, status.copy(), gain
 
 
 def read(

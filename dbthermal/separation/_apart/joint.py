@@ -117,10 +117,8 @@ class Joint:
     factor: Callable[[], Floats]  # variance of the object over that of a pixel alone (pixel) [1]
     unsettled: Mask  # the iteration did not come to an end (pixel)
 
-    def difference(self, rows: slice, selected: slice | Whole) -> Floats:
+    def difference(self, pixels: Whole) -> Floats:
         """Signals (band - 1, time, pixel) [K] of x(p) over x(r), of some pixels; 0 unknown."""
-        width = self.inputs.capture.sizes["x"]
-        pixels = np.arange(rows.start * width, rows.stop * width)[selected]
         return self.at(slice(None), pixels)
 
     def at(self, frames: slice | Whole, pixels: Whole) -> Floats:
@@ -140,10 +138,10 @@ class Joint:
         assert displacement is not None
         time, std = self.inputs.capture["time"].values, result["object_temperature_std"].values
         background = result["background_temperature"].values
-        basis = smooth.largest(time).functions
+        basis = smooth.largest(time).functions.astype(np.float32)
         every = []
         for rows in self.inputs.blocks:
-            film = background[:, rows].reshape(time.size, -1).astype(np.float64)
+            film = np.array(background[:, rows]).reshape(time.size, -1)
             every.append(basis.T @ system.bridge(film, np.ones(film.shape[1], dtype=bool)))
             release()
         curves = np.concatenate(every, axis=1).reshape(-1, *status.shape)
@@ -155,7 +153,7 @@ class Joint:
         weights = (1.0 - self.emissivity) * system.weights(self.inputs, self.emissivity)
         off = np.nan_to_num(weights[1:].sum(0) * displacement.std).reshape(2, *status.shape)
         slopes = [
-            gaussian_filter1d(curves, 1.0, axis=axis, order=1) * component
+            gaussian_filter1d(curves, 1.0, axis=axis, order=1) * component.astype(np.float32)
             for axis, component in zip((1, 2), off, strict=True)
         ]
         factor = self.factor().reshape(status.shape)

@@ -17,7 +17,6 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 from numpy.polynomial import Polynomial
-from scipy.ndimage import correlate1d
 
 from dbthermal import _smooth as smooth
 from dbthermal import schema
@@ -162,14 +161,13 @@ def project(inputs: Inputs, result: xr.Dataset, emissivity: Floats, threads: Exe
                 for band, signal in enumerate(signals):
                     straight[band][:, places] = inverse @ signal
                 if inputs.difference is not None:
-                    more = inputs.difference(cut.window[0], slice(None))[:, frames]
-                    index = np.searchsorted(cut.places, places)
+                    more = inputs.difference(places)[:, frames]
                     for band, changes in enumerate(more, 1):
-                        straight[band][:, places] += inverse @ changes[:, index]
+                        straight[band][:, places] += inverse @ changes
                 _without_object(signals, emitted, shares, response)
                 for band, signal in enumerate(signals):
                     maps[band][:, row, column] = quick.T @ signal
-                noise[0][:, row, column] = np.array(tile.noise)[:, np.newaxis]
+                noise[0][:, row, column] = tile.scaled(tile.noise)
                 freedom[row, column] = np.sum(quick**2, dtype=np.float64)
                 usable[row, column] = True
         release()
@@ -281,6 +279,25 @@ def _gaussian(deviation: float) -> Array:
 
 def _smoothed(maps: npt.NDArray[Any], taps: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Maps (..., y, x) with the weights applied along either side, zero outside."""
-    for axis in (-2, -1):
-        maps = correlate1d(maps, taps, axis, mode="constant")
-    return np.asarray(maps)
+    result = np.zeros_like(maps)
+    images = (film.reshape(-1, *maps.shape[-2:]) for film in (np.ascontiguousarray(maps), result))
+    _smooth(*images, taps)
+    return result
+
+
+@compiled
+def _smooth(images: Any, result: Any, taps: Any) -> None:
+    """Sums of images (image, y, x) with weights along either side, in place, zero before."""
+    count, height, width = images.shape
+    reach, rows = taps.size // 2, np.empty((height, width), images.dtype)
+    for image in range(count):
+        rows[:] = 0.0
+        for y in range(height):
+            for near in range(max(y - reach, 0), min(y + reach + 1, height)):
+                weight, source = taps[near - y + reach], images[image, near]
+                for x in range(width):
+                    rows[y, x] += weight * source[x]
+            out = result[image, y]
+            for step in range(-reach, reach + 1):
+                for x in range(max(-step, 0), width - max(step, 0)):
+                    out[x] += taps[step + reach] * rows[y, x + step]

@@ -103,14 +103,12 @@ class History:
         for cut in tiles.cut(inputs, slice(rows[0], rows[-1] + 1)):
             maps = np.full((7, cut.status.size), np.nan, np.float32)
             second = self._gain[cut.window].ravel().astype(np.float64)
-            gain = np.stack([np.ones_like(second), second])
-            for section in cut.parts:
-                for _, pixels, tile in tiles.of_one_noise(*section, gain, second.size):
-                    estimate: Any = separate_smooth(tile, inputs.settings)
-                    (a, b), (_, d) = estimate.emissivity_covariance
-                    ratio = estimate.reflection_ratio[1], estimate.reflection_ratio_std[1] ** 2
-                    maps[:, pixels] = [*ratio, *estimate.emissivity, a, b, d]
-                    cut.status[pixels] |= estimate.status
+            for _, pixels, tile in cut.parts:
+                estimate: Any = separate_smooth(replace(tile, gain=second[pixels]), inputs.settings)
+                (a, b), (_, d) = estimate.emissivity_covariance
+                ratio = estimate.reflection_ratio[1], estimate.reflection_ratio_std[1] ** 2
+                maps[:, pixels] = [*ratio, *estimate.emissivity, a, b, d]
+                cut.status[pixels] |= estimate.status
             shape = self.status[cut.window].shape
             self.maps[(slice(None), *cut.window)] = maps.reshape(7, *shape)
             self.status[cut.window] = cut.status.reshape(shape)

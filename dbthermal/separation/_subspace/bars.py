@@ -68,7 +68,7 @@ def _walk(model: Model, curve_variance: float, count: int, work: Work) -> tuple[
         low, high, lost = OCTAVES[octave]
         walk, last = 0.0, min(high - 1, degrees)
         for j in range(low - 1, last):
-            noise = model.noise[0] ** 2 / share + (curve_variance if j + 1 < count else 0.0)
+            noise = work.noise[0] ** 2 / share + (curve_variance if j + 1 < count else 0.0)
             walk += (j + 1.0) ** 2 * (spectrum[j] ** 2 - noise)
         freedom = last - (low - 1) - lost
         if freedom > 0:
@@ -101,7 +101,7 @@ def _linear(model: Model, record: Any, line: Line, limit: float, work: Work) -> 
             length += kernel[t] * drift[t]
             size += kernel[t] * residual[t]
         size /= length
-    variance = model.noise[0] ** 2 * kernels.dot(kernel, kernel)
+    variance = work.noise[0] ** 2 * kernels.dot(kernel, kernel)
     curve = _curve_variance(model, kernel, count, record.null_variance, work)
     variance = (variance + work.emissivity[0] ** 2 * curve) / length**2
     before = max((limit / model.spread) ** 2, size**2 + variance)
@@ -118,13 +118,13 @@ def _propagate(model: Model, record: Any, epsilon: float, work: Work) -> bool:
     the width of its 95 % interval by Fieller's theorem (1954),
     doi:10.1111/j.2517-6161.1954.tb00159.x
     """
-    count, null, noise = record.order + model.steps, record.null_variance, model.noise[0]
+    count, null, noise = record.order + model.steps, record.null_variance, work.noise[0]
     sensitivity, smooth_variance, curve = work.sensitivity, work.smooth_variance, work.rapid
     first, frames, total, factors = work.emissivity[0], work.first.size, 0.0, work.factors
     kernels.combined(model.object_part, model.spans, work.coefficients[0], count, curve)
     # The error moves weight from the other bands to the first, by their share in its variance.
     for m in range(1, factors.size):
-        error = model.noise[m] ** 2 + (work.ratio[m] * noise) ** 2
+        error = work.noise[m] ** 2 + (work.ratio[m] * noise) ** 2
         factors[m] = work.null_weights[m] ** 2 * error
         total += factors[m]
     emitted = work.at_object[0, :frames]
@@ -182,15 +182,13 @@ def bars(model: Model, record: Any, line: Line, work: Work, covariance: Any) -> 
     epsilon = record.inverse_energy * null + by_level**2
     record.restless = _propagate(model, record, epsilon, work)
     _background(model, record, epsilon, noise_variance + drift_variance, work)
-    _covariance(model, record, noise_variance + drift_variance, work, covariance)
+    _covariance(record, noise_variance + drift_variance, work, covariance)
     record.epsilon_variance = epsilon
     record.noise_variance, record.drift_variance = noise_variance, drift_variance
 
 
 @inlined
-def _covariance(
-    model: Model, record: Any, slope_variance: float, work: Work, covariance: Any
-) -> None:
+def _covariance(record: Any, slope_variance: float, work: Work, covariance: Any) -> None:
     r"""Covariance of the emissivities (eq. 8), from the ratios and the slope, in place.
 
     :math:`\delta e_1 = -e_1 (1 - e_1) \epsilon + \delta o` and
@@ -198,12 +196,12 @@ def _covariance(
     :math:`\epsilon = \sum w_m \delta \kappa_m`.
     """
     k, change, error, bands = work.ratio, work.turned, work.turns, work.ratio.size
-    first, square = work.emissivity[0], model.noise[0] ** 2
+    first, square = work.emissivity[0], work.noise[0] ** 2
     for m, n in np.ndindex(bands, bands):
         same = 1.0 if m == n else 0.0
         change[m, n] = (1.0 - first) * (first * k[m] * work.null_weights[n] + same)
         # Of the ratios (eq. 4), and through the background's level; the first one is 1.
-        error[m, n] = record.inverse_energy * (k[m] * k[n] * square + same * model.noise[m] ** 2)
+        error[m, n] = record.inverse_energy * (k[m] * k[n] * square + same * work.noise[m] ** 2)
         error[m, n] += work.level[m] * work.level[n]
     for m, n in np.ndindex(bands, bands):
         covariance[m, n] = k[m] * k[n] * slope_variance
@@ -221,7 +219,7 @@ def _background(model: Model, record: Any, epsilon: float, slope: float, work: W
 
     where r is the weighted mean of :math:`e_m / (1 - e_m)` and :math:`v = \kappa / s`.
     """
-    noise, share, variance = model.noise, work.share, work.background_variance
+    noise, share, variance = work.noise, work.share, work.background_variance
     first, total, object_share, length = work.emissivity[0], 0.0, 0.0, 0.0
     for m in range(noise.size):
         total += ((1.0 - work.emissivity[m]) / noise[m]) ** 2
@@ -239,7 +237,7 @@ def _background(model: Model, record: Any, epsilon: float, slope: float, work: W
         variance[t] = value + contrast**2 * steady
     patterned = 0.0
     for m in range(noise.size):
-        patterned += model.pattern[m]
+        patterned += work.pattern[m]
     if patterned > 0.0:
         _pattern(model, work)
 
@@ -266,7 +264,7 @@ def _pattern(model: Model, work: Work) -> None:
             through[t] += direct * slope[t]
     kernels.blackbody(kernels.response(model.tables, 0), work.background, work.mean, slope)
     for m in range(work.share.size):
-        direct, square = work.share[m] / (1.0 - work.emissivity[m]), model.pattern[m] ** 2
+        direct, square = work.share[m] / (1.0 - work.emissivity[m]), work.pattern[m] ** 2
         for t in range(slope.size):
             share = work.null_weights[m] / steepness[t]
             work.variance[t] += square * share**2
@@ -314,7 +312,7 @@ def _unsteady(model: Model, record: Any, work: Work) -> tuple[float, float, bool
     Hilferty 1931, doi:10.1073/pnas.17.12.684). The delay is the largest score in magnitude.
     """
     residual, rapid, steep = work.null_residual, work.rapid, work.spare
-    frames, null, noise = residual.size, record.null_variance, model.noise[0]
+    frames, null, noise = residual.size, record.null_variance, work.noise[0]
     energy = kernels.dot(residual, residual)
     lagged = 0.0
     for lag in range(1, LAGS + 1):

@@ -133,16 +133,16 @@ class Solved(NamedTuple):
 
 
 @inlined
-def _bent(model: Model, work: Work, frames: int) -> bool:
+def _bent(work: Work, frames: int) -> bool:
     """Say whether the bend has changed by more energy about its mean than `pixel.BEND`."""
     bent = False
-    for m in range(1, model.noise.size):
+    for m in range(1, work.noise.size):
         total, square = 0.0, 0.0
         for t in range(frames):
             change = work.bend[m, t] - work.removed[m, t]
             total += change
             square += change**2
-        bent |= square - total**2 / frames > (pixel.BEND * model.noise[m]) ** 2
+        bent |= square - total**2 / frames > (pixel.BEND * work.noise[m]) ** 2
     return bent
 
 
@@ -151,7 +151,7 @@ def _pixel(
     model: Model, work: Work, films: Any, record: Any, vectors: Any, covariance: Any
 ) -> None:
     """Steps 1 to 4, on the exact model where it matters, and all that the flags need."""
-    frames, bands = work.first.size, model.noise.size
+    frames, bands = work.first.size, work.noise.size
     for m in range(bands):
         kernels.copy(work.signals[m, :frames], work.straight[m, :frames])
         kernels.fill(work.removed[m, :frames], 0.0)
@@ -163,12 +163,12 @@ def _pixel(
         # The bend of a gray body is not known: it is told from the signals as they are.
         if rounds == 0:
             gray = pixel.may_be_gray(model, record, work)
-        if rounds == pixel.BENDS or not _bent(model, work, frames):
+        if rounds == pixel.BENDS or not _bent(work, frames):
             break
         rounds += 1
         _straighten(work, bands, frames)
     bars.bars(model, record, line, work, covariance)
-    _write(model, work, record, vectors)
+    _write(work, record, vectors)
     object_ = _film(work.temperature, work.variance, model, films[0], films[1])
     background = _film(work.background, work.background_variance, model, films[2], films[3])
     for i, judged in enumerate((object_, background)):
@@ -194,8 +194,8 @@ def _scatters(model: Model, work: Work, record: Any, matrices: Any) -> None:
     Without the bend that is too small to be seen in a pixel, but not in many; a pixel with the
     emissivity of its material is not asked for its scatter.
     """
-    bands, frames, orders = model.noise.size, work.first.size, len(work.scatter)
-    if np.isnan(work.material[2]) and not _bent(model, work, frames):
+    bands, frames, orders = work.noise.size, work.first.size, len(work.scatter)
+    if np.isnan(work.material[2]) and not _bent(work, frames):
         _straighten(work, bands, frames)
         pixel.scatter(model, work)
     _straight_noise(model, work, work.turned, work.axis)
@@ -223,23 +223,23 @@ def _straight_noise(model: Model, work: Work, covariance: Array, rate: Array) ->
     slope = kernels.exact(kernels.response(model.tables, 0), level)[1]
     for m in range(rate.size):
         emissivity, response = work.emissivity[m], kernels.response(model.tables, m)
-        rate[m] = (1.0 - emissivity) / model.noise[m] * kernels.exact(response, level)[1]
+        rate[m] = (1.0 - emissivity) / work.noise[m] * kernels.exact(response, level)[1]
         energy += rate[m] ** 2
         physical &= 0.0 < emissivity < 1.0
     for m in range(rate.size):
         for k in range(rate.size):
             covariance[m, k] = 1.0 if m == k else 0.0
             if physical and energy > 0.0:
-                first = rate[m] - (1.0 - work.emissivity[m]) / model.noise[m] * slope
-                second = rate[k] - (1.0 - work.emissivity[k]) / model.noise[k] * slope
+                first = rate[m] - (1.0 - work.emissivity[m]) / work.noise[m] * slope
+                second = rate[k] - (1.0 - work.emissivity[k]) / work.noise[k] * slope
                 shared = first * rate[k] + rate[m] * second - first * second
                 covariance[m, k] -= shared / energy
 
 
 @inlined
-def _write(model: Model, work: Work, record: Any, vectors: Any) -> None:
+def _write(work: Work, record: Any, vectors: Any) -> None:
     """Ratios, their variances, null combination and emissivities, in place."""
-    noise = model.noise
+    noise = work.noise
     for m in range(noise.size):
         vectors[0, m], vectors[2, m] = work.ratio[m], work.null_weights[m]
         vectors[3, m] = work.emissivity[m]
@@ -269,7 +269,13 @@ def _return(turned: Any, places: Whole, samples: Any) -> None:
 
 @kernels.entered
 def _separate(
-    model: Model, signals: Array, places: Whole, materials: Array, work: Work, solved: Solved
+    model: Model,
+    signals: Array,
+    places: Whole,
+    materials: Array,
+    errors: Array,
+    work: Work,
+    solved: Solved,
 ) -> None:
     """Steps of some pixels of a tile."""
     samples, outside, pixels = work.inside, work.outside, places.size
@@ -279,9 +285,11 @@ def _separate(
         _turn(signals, together, samples)
         for p in range(together.size):
             place = np.uintp(together[p])
-            for m in range(model.noise.size):
+            for m in range(work.noise.size):
                 kernels.copy(samples[p, m], work.signals[m])
             kernels.copy(materials[place], work.material)
+            kernels.copy(errors[0, place], work.noise)
+            kernels.copy(errors[1, place], work.pattern)
             record, matrices = solved.record[place], solved.matrices[place]
             _pixel(model, work, outside[p], record, solved.vectors[place], matrices[3])
             bars.judge(model, work, record, solved.sums[..., place])
@@ -302,8 +310,6 @@ def share(tile: Tile, functions: smooth.Subspace, drift: float) -> Model:
         rising=np.ascontiguousarray(functions.rising.T),
         whole=np.full((degrees, 2), [0, tile.time.size]),
         spread=float(np.ptp(functions.rising[:, 0])),
-        noise=np.array(tile.noise),
-        pattern=np.array(tile.pattern or np.zeros(second_bands + 1)),
         drift=drift / np.sqrt(3.0),
         chances=(float(chdtri(second_bands, chances[0])), float(chdtri(second_bands, chances[1]))),
         widened=(stdtrit(np.maximum(freedom, 1), 0.975) / bars.NORMAL95) ** 2,
@@ -390,6 +396,7 @@ def solve(
         numbers = (material.inverse_energy, material.emissivity)
         spreads = (material.noise_variance, material.drift_variance, material.spread)
         materials[:] = np.stack([*numbers, *spreads, *material.ratio], 1)
+    errors = np.stack([tile.scaled(tile.noise).T, tile.scaled(tile.pattern or (0.0,) * bands).T])
     films = np.empty((4, frames, pixels), np.float32)
     record, sums = np.zeros(pixels, RECORD), np.zeros((2, shared.parts.size - 1, pixels))
     vectors, matrices = np.zeros((pixels, 4, bands)), np.zeros((pixels, 4, bands, bands))
@@ -400,7 +407,7 @@ def solve(
         model, count = shared._replace(**_columns(of_part)), of_part.functions.shape[1]
         space["coefficients"], space["columns"] = np.empty((bands, count)), np.empty(count)
         space["scatter"] = np.empty((of_part.orders, bands, bands))
-        _separate(model, signals, places, materials, Work(**space), solved)
+        _separate(model, signals, places, materials, errors, Work(**space), solved)
     named: dict[str, Any] = {name: np.moveaxis(record[name], 0, -1) for name in RECORD.names or ()}
     squares = matrices.transpose(1, 2, 3, 0)
     named |= {

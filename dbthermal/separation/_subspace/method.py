@@ -240,7 +240,6 @@ def _flags(tile: Tile, solution: Solution) -> dict[Status, Mask]:
 
 def _searched(tile: Tile, functions: smooth.Subspace, drift: float) -> Estimate:
     """All steps: pixels that do not fit are solved anew with polynomials in pieces of the time."""
-    noise = np.array(tile.noise)
     solution = fused.solve(tile, functions, drift)
     used = solution.order + functions.steps
     asked = pieces.asked(solution.sums, tile.time, solution.null_variance, used)
@@ -251,10 +250,11 @@ def _searched(tile: Tile, functions: smooth.Subspace, drift: float) -> Estimate:
         return result
     first = np.zeros((tile.time.size, suspect.size), dtype=bool)
     suspects, best = tile.select_pixels(suspect), result.select_pixels(suspect)
+    noise = suspects.scaled(tile.noise)
     white, axes = pieces.plane(suspects.signals, noise)
     axis = np.full((2, suspect.size), np.nan)
     if suspects.material is not None:
-        axis = np.einsum("abp,bp->ap", axes, suspects.material.ratio / noise[:, np.newaxis])
+        axis = np.einsum("abp,bp->ap", axes, suspects.material.ratio / noise)
         axis /= np.sqrt((axis**2).sum(axis=0))
     pooled = np.where(solution.pooled[suspect], axis, np.nan)
     energy, count = pieces.null_energy(white, functions, pooled)
@@ -300,9 +300,10 @@ def _finished(tile: Tile, estimate: Estimate, first: Mask, functions: smooth.Sub
         surveyed &= np.isnan(tile.material.noise_variance)
     if surveyed.any():
         straight = _straight(tile.select_pixels(surveyed), estimate.select_pixels(surveyed))
+    noise = tile.scaled(tile.noise)[:, surveyed]
     for place, number in enumerate(_NUMBERS if surveyed.any() else (), 1):
         parts = _parts(tile, first[:, surveyed], functions, number)
-        estimate.replace_scatter(place, surveyed, *pieces.outside(straight, tile.noise, parts))
+        estimate.replace_scatter(place, surveyed, *pieces.outside(straight, noise, parts))
     std = _AS_GIVEN * estimate.object_temperature_std
     jumping = divided & pieces.sudden(estimate.object_temperature, std, tile.time)
     status = estimate.status | status_bits({Status.OBJECT_JUMP: jumping})

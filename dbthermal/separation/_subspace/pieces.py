@@ -85,11 +85,11 @@ def asked(sums: Array, time: Array, variance: Array, used: Whole) -> Mask:
 
 
 def outside(
-    signals: Array, noise: tuple[float, ...], divided: Iterable[tuple[Whole, smooth.Subspace]]
+    signals: Array, noise: Array, divided: Iterable[tuple[Whole, smooth.Subspace]]
 ) -> tuple[Array, Array]:
     """Scatter (band, band, pixel) [1] outside the functions of parts less noise, and its freedom.
 
-    Of signals (pixel, band, time) [K], whitened.
+    Of signals (pixel, band, time) [K], whitened by their noise (band, pixel) [K].
     """
     pixels, bands, frames = signals.shape
     scatter, freedom = np.empty((pixels, bands, bands)), np.empty(pixels)
@@ -97,7 +97,7 @@ def outside(
         columns = np.ascontiguousarray(of_part.functions.T)
         _outside(columns, of_part.spans, signals, places, np.empty((bands, len(columns))), scatter)
         freedom[places] = frames - len(columns)
-    whitened = scatter.transpose(1, 2, 0) / np.multiply.outer(noise, noise)[..., np.newaxis]
+    whitened = scatter.transpose(1, 2, 0) / (noise[:, np.newaxis] * noise)
     return whitened - freedom * np.eye(bands)[..., np.newaxis], freedom
 
 
@@ -121,7 +121,7 @@ def plane(signals: Array, noise: Array) -> tuple[Array, Array]:
     Object and background change more than two bands along two lines: of the whitened signals all
     but the noise lies in one plane, with axes (2, band, pixel) [1]. Two bands are the plane.
     """
-    white = signals / noise[:, np.newaxis, np.newaxis]
+    white = signals / noise[:, np.newaxis]
     if len(noise) == 2:
         return white, np.repeat(np.eye(2)[..., np.newaxis], signals.shape[2], axis=2)
     changes = white - white.mean(axis=1, keepdims=True)
@@ -194,7 +194,7 @@ def check_clock(signals: Array, time: Array, noise: Array, segment: Whole | None
     axis is compared, pixel by pixel, by :math:`N \ln(E_{time} / E_{number})`. Where it is as large
     in both, the object does not change smoothly, or its changes are too small to tell.
     """
-    frames, white = time.size, plane(signals, noise)[0]
+    frames, white = time.size, plane(signals, noise[:, np.newaxis])[0]
     any_axis = np.full((2, white.shape[2]), np.nan)
     chi2 = []
     for clock in (time, np.arange(frames, dtype=np.float64)):

@@ -37,8 +37,6 @@ class Model(NamedTuple):
     leverage: Array  # (order, time)
     steps: int
     stepless: bool  # no function has a step of the camera: both are the same
-    noise: Array  # (band) [K]
-    pattern: Array  # (band) [K]
     drift: float  # limit of the background's, over the square root of three [K]
     rates: Array  # change of the ratios of the responses' slopes with the background (band) [1/K]
     gray: Array  # ratios of the slopes at temperatures of the background (temperature, band) [1]
@@ -94,6 +92,8 @@ class Work(NamedTuple):
     factors: Array  # w_m e_m of eq. 6
     share: Array  # of the bands in the background
     level: Array  # deviation of the ratios by the background's level
+    noise: Array  # standard deviation of the signals [K]
+    pattern: Array  # residual fixed pattern [K]
     material: Array  # inverse energy, emissivity, its two variances, spread, ratios; NaN for none
     inside: Array  # signals of some pixels [K] (pixel, band, time)
     outside: Any  # their films, in single precision (pixel, 4, time)
@@ -123,7 +123,7 @@ def ratios(model: Model, work: Work, record: Any) -> None:
     :math:`\sigma^2 = 1 / S + n / (S^2 |v|^2)` (Fuller 1987, doi:10.1002/9780470316665). The first
     term alone is the Cramer-Rao bound; see `limits.bounds`.
     """
-    noise, material, ratio, axis = model.noise, work.material, work.ratio, work.axis
+    noise, material, ratio, axis = work.noise, work.material, work.ratio, work.axis
     bands, orders, frames = noise.size, len(work.scatter), work.first.size
     scatter(model, work)
     pooled, along = False, work.material_axis
@@ -171,7 +171,7 @@ def ratios(model: Model, work: Work, record: Any) -> None:
 def scatter(model: Model, work: Work) -> None:
     """Scatter of the whitened signals outside the functions of each order (eq. 3)."""
     straight, coefficients = work.straight, work.coefficients
-    bands, frames = model.noise.size, work.first.size
+    bands, frames = work.noise.size, work.first.size
     for m in range(0, bands - 1, 2):
         first, second = straight[m, :frames], straight[m + 1, :frames]
         kernels.projected_both(model.functions, model.spans, first, second, coefficients[m : m + 2])
@@ -185,7 +185,7 @@ def scatter(model: Model, work: Work) -> None:
         for n in range(m + 1):
             product = kernels.dot(straight[m, :frames], straight[n, :frames])
             first, second = coefficients[m], coefficients[n]
-            scale = 1.0 / (model.noise[m] * model.noise[n])
+            scale = 1.0 / (work.noise[m] * work.noise[n])
             for j in range(model.steps):
                 product -= first[j] * second[j]
             for order in range(len(work.scatter)):
@@ -243,7 +243,7 @@ def may_be_gray(model: Model, record: Any, work: Work) -> bool:
     likely to lie between any two of some temperatures. The chance is the mean over them of that of
     the chi-square, with a degree of freedom for each band but one, of the nearest ratios between.
     """
-    noise, ratio, bands, length = model.noise, work.ratio, model.noise.size, 0.0
+    noise, ratio, bands, length = work.noise, work.ratio, work.noise.size, 0.0
     for m in range(bands):
         length += (ratio[m] / noise[m]) ** 2
     nearest, chance, off, before = np.inf, 0.0, work.turned[0], work.turned[1]
@@ -354,7 +354,7 @@ def emission(model: Model, record: Any, work: Work, rounds: int) -> Line:
     for turn in range(ROUNDS):
         _approach(model, emissivity, work, work.emitted)
         slope, variance, scale, energy = regression.regress(
-            work.emitted, z, model.noise[0], weights, work.residual, work.few, rounds + turn > 0
+            work.emitted, z, work.noise[0], weights, work.residual, work.few, rounds + turn > 0
         )
         constant = energy < OBJECT_TO_NOISE * count * record.null_variance and not fixed
         rate = (slope - slope_before) / (emissivity - before)
@@ -376,7 +376,7 @@ def background(model: Model, work: Work) -> None:
     mean, result, step, curvature = work.mean, work.background, work.spare, work.curvature
     first, total, outside = kernels.response(tables, 0), 0.0, 0.0
     for m in range(share.size):
-        share[m] = ((1.0 - emissivity[m]) / model.noise[m]) ** 2
+        share[m] = ((1.0 - emissivity[m]) / work.noise[m]) ** 2
         total += share[m]
     kernels.fill(mean, 0.0)
     for m in range(share.size):
