@@ -318,8 +318,8 @@ class Field:
         rows, columns = (_pairs(pair) for pair in self.spline.values(centres))
         height, width = self.spline.nodes
         blocks = self.covariance.reshape(2, height, width, 2, height, width)
-        parts = [blocks[axis, :, :, axis].transpose(0, 2, 1, 3) for axis in (0, 1)]
-        return np.stack([rows @ it.reshape(height**2, width**2) @ columns.T for it in parts])
+        planes = [blocks[axis, :, :, axis].transpose(0, 2, 1, 3) for axis in (0, 1)]
+        return np.stack([rows @ it.reshape(height**2, width**2) @ columns.T for it in planes])
 
 
 @lru_cache(maxsize=16)  # of the levels from coarse to fine
