@@ -18,7 +18,7 @@ import xarray as xr
 from scipy.ndimage import binary_dilation, gaussian_filter
 
 from dbthermal._arrays import Array
-from reproduction import metrics, numbers, palettes, uncalibrated
+from reproduction import numbers, palettes, uncalibrated
 
 BANDS: Final = {"8-14": 0, "9.5": 1}
 """Band and the number in its video's name; the second is published as 9.25-9.75 um."""
@@ -142,7 +142,7 @@ def agreement(
 
     Our reflection (time, y, x), smoothed by `SMOOTHING`, is compared over those of the pixels that
     the authors' map covers in all of these frames. Raises a ValueError if the frames differ in
-    number or size.
+    number or size, or a map is constant or unknown where it is compared.
     """
     if theirs["value"].shape != reflection.shape:
         rule = f"Must be {reflection.shape}"
@@ -154,7 +154,13 @@ def agreement(
     smoothed = gaussian_filter(ours.values * inside, width)
     weight = gaussian_filter(inside, width)
     ours = ours.copy(data=np.abs(np.divide(smoothed, weight, where=inside > 0, out=inside)))
-    return metrics.correlation(ours, theirs["value"], theirs["valid"].all("time") & pixels)
+    covered = (theirs["valid"].all("time") & pixels).values
+    pairs = zip(ours.values[:, covered], theirs["value"].values[:, covered], strict=True)
+    with np.errstate(invalid="ignore"):
+        scores = np.array([np.corrcoef(*pair)[0, 1] for pair in pairs])
+    if not np.all(np.isfinite(scores)):
+        raise ValueError("Constant or unknown map where it is compared. Must be known, and vary.")
+    return ours["time"].copy(data=scores)
 
 
 def strongest(reflection: xr.DataArray, outline: xr.DataArray, number: int) -> npt.NDArray[np.intp]:
