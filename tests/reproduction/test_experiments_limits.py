@@ -34,14 +34,6 @@ test_experiments_that_cannot_be_made = refused(
             "Invalid size 3 of a group. Must divide the 400 pixels",
         ),
         (
-            lambda: limits.border_kept(*[xr.DataArray([[0, 0]], dims=("y", "x"))] * 2),
-            "1 panels. Must be alike, of two panels or more",
-        ),
-        (
-            lambda: nuisances.apart(-1, pixels={}, seed=1),
-            "Invalid delay -1 frames. Must be zero or positive",
-        ),
-        (
             lambda: nuisances.disturbed("rain", pixels={}, nuisance={}, seed=1),
             "Unknown nuisance 'rain'. Must be one of",
         ),

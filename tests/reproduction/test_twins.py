@@ -236,9 +236,6 @@ test_refusals = refused(
     lambda wrong: wrong(),
     [
         (lambda: twins.twin("teapot", SHORT, rng()), "Unknown twin 'teapot'"),
-        (lambda: Capture(GLASS[:1], baseline=0.04), "Must be two"),
-        (lambda: Capture(GLASS.rename(band="filter")), "Must be .band,."),
-        (lambda: Capture(GLASS, blur=0.0), "Invalid blur 0.0"),
         (bead("fingers", 2), "Invalid bead 2 pixels. Must be odd"),
         (bead("coffee_pot", 31), "its bead reaches beyond the object"),
         (probe(0.01, 0.0), "Must be on the object"),

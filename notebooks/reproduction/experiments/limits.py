@@ -215,14 +215,9 @@ def border_kept(labels: xr.DataArray, truth: xr.DataArray) -> xr.Dataset:
 
     `right` [1], share of the pixels farther than `BORDER` from a border that carry the label most
     frequent in their panel; `bleeding` [1], number of labels that are on both sides of a border,
-    that far from it. Raises a ValueError if the images differ in size, or there is one panel only.
+    that far from it.
     """
     estimate, panels = labels.values, np.unique(truth.values)
-    if estimate.shape != truth.shape or panels.size < 2:
-        raise ValueError(
-            f"Invalid images of {estimate.shape} and {truth.shape} pixels, {panels.size} panels. "
-            "Must be alike, of two panels or more."
-        )
     distance = np.zeros(estimate.shape)
     for panel in panels:
         distance += distance_transform_edt(truth.values == panel)

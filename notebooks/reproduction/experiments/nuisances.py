@@ -65,11 +65,8 @@ def apart(delay: float, *, pixels: Mapping[str, Any], seed: int) -> xr.Dataset:
 
     The delay of the second band is rounded to 1 / `cases.STEPS`; `pixels` are fields of `Pixels`.
     `found` [frame] is the offset by `alignment.time_offset`; over `treatment` the variables of
-    `cost`, where "without" is a capture of both bands at the later time. Raises a ValueError if the
-    delay is negative.
+    `cost`, where "without" is a capture of both bands at the later time.
     """
-    if delay < 0:
-        raise ValueError(f"Invalid delay {delay} frames. Must be zero or positive.")
     kind, later = Pixels(**pixels), round(delay * STEPS)
     rng, response = np.random.default_rng(seed), Rig().response()
     scene = kind.scene(rng, later=later, steps=STEPS)

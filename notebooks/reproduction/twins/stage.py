@@ -51,17 +51,6 @@ class Capture:
     blur: float = 0.6  # standard deviation [pixel]
     rays: int = 3  # for each pixel along either side
 
-    def __post_init__(self) -> None:
-        """Check bands, baseline and rays."""
-        if self.emissivity.dims != ("band",):
-            raise ValueError(f"Invalid dims {self.emissivity.dims} of emissivity. Must be (band,).")
-        if self.baseline and self.emissivity.sizes["band"] != 2:
-            names = [str(name) for name in self.emissivity["band"].values]
-            raise ValueError(f"Invalid bands {names} for a baseline. Must be two.")
-        if not (self.blur > 0 and self.rays >= 1):
-            rule = "Must be positive"
-            raise ValueError(f"Invalid blur {self.blur} or rays {self.rays} of a pixel. {rule}.")
-
 
 @dataclass(frozen=True)
 class Stage:
