@@ -199,6 +199,7 @@ def library_mixture(bands: Iterable[str]) -> xr.Dataset:
     covariance[:, i, j] = covariance[:, j, i] = values[:, 1 + count :]
     places = [list(FILTERS).index(name) for name in names]
     share, mean, std, shared = _OTHERS
+    # Of a material outside the libraries, all pairs of bands are correlated alike.
     wide = std**2 * (shared + (1.0 - shared) * np.eye(len(names)))
     means = values[:, 1 : 1 + count][:, places]
     weight = np.append(values[:, 0] / values[:, 0].sum() * (1.0 - share), share)
@@ -259,11 +260,13 @@ def _average(
     lower, upper = max(band.lower, float(wavelength[0])), min(band.upper, float(wavelength[-1]))
     if upper <= lower:
         return np.nan, 0.0
+    # Corners of the spectrum are knots: Gauss's rule needs a smooth integrand between them.
     nodes_inside = wavelength[(wavelength > lower) & (wavelength < upper)]
     knots = np.union1d(np.linspace(lower, upper, _STEPS + 1), nodes_inside)
     half = 0.5 * np.diff(knots)[:, np.newaxis]
     nodes = knots[:-1, np.newaxis] + half * (1.0 + _NODES)
     weights = half * _WEIGHTS * planck.spectral_radiance(nodes, temperature)
+    # What is unknown weighs nothing, and lacks in the coverage.
     gap = np.diff(wavelength) > (1.0 + 1e-9) * _GAP
     weights *= ~gap[np.searchsorted(wavelength, nodes[:, 1:2]) - 1]
     covered = float(np.sum(weights))
@@ -406,8 +409,10 @@ def background_ratio(result: xr.Dataset, mask: xr.DataArray) -> xr.Dataset:
     seen = np.isfinite(ratio).all(axis=0) & np.isfinite(std).all(axis=0)
     if not seen.any():
         raise ValueError("Missing reflection ratio of the foil. Something must move in it.")
+    # A pixel of the reference band has no deviation, and every pixel of it the same ratio.
     weights = np.where(std > 0.0, 1.0 / np.maximum(std, 1e-9) ** 2, 1.0)[:, seen]
     mean = np.average(ratio[:, seen], axis=1, weights=weights)
+    # Pixels may err together: neither deviations nor scatter are divided by their number.
     square = (ratio[:, seen] - mean[:, np.newaxis]) ** 2
     scatter = np.average(square, axis=1, weights=weights)
     variance = np.maximum(1.0 / weights.mean(axis=1), scatter)

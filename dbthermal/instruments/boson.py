@@ -28,7 +28,6 @@ from typing import Any, Final, Generic, TypeVar
 
 from scipy.constants import zero_Celsius
 
-from dbthermal import _numbers
 from dbthermal.instruments import telemetry, v4l2
 from dbthermal.instruments.camera import CameraKind, FfcMode, FfcStatus, GainMode, Identity
 from dbthermal.instruments.transport import Closing, Transport
@@ -178,15 +177,11 @@ def checksum(content: bytes) -> int:
 def encode(frame: Packet) -> bytes:
     """Bytes of a frame; header, data and checksum are all escaped.
 
-    TypeError or ValueError if a number does not fit its field, or the data are too long.
+    ValueError if the data are too long, struct.error if a number does not fit its field.
     """
-    numbers = {"channel": frame.channel, "sequence number": frame.sequence}
-    numbers |= {"command": frame.command, "status": frame.status}
-    for name, value in numbers.items():
-        _numbers.whole_number(name, value, (0, 0xFF if name == "channel" else 0xFFFFFFFF))
     if (size := len(frame.data)) > MAXIMUM_DATA:
         raise ValueError(f"Invalid data of {size} bytes. Must be at most {MAXIMUM_DATA}.")
-    content = _HEADER.pack(*numbers.values()) + frame.data
+    content = _HEADER.pack(frame.channel, frame.sequence, frame.command, frame.status) + frame.data
     content += _CHECKSUM.pack(checksum(content))
     pieces = (_ESCAPE + bytes((v - _SHIFT,)) if v in _SPECIAL else bytes((v,)) for v in content)
     return _START + b"".join(pieces) + _END

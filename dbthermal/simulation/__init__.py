@@ -84,6 +84,7 @@ class Background:
                 start = rng.uniform(time[0], time[-1], pixels)
                 stop = start + rng.uniform(*self.duration, pixels)
                 active = (time[:, np.newaxis] >= start) & (time[:, np.newaxis] < stop)
+                # A pixel has its own number of pulses; those beyond it are drawn, and stay out.
                 change += self.amplitude * (active & (pulse < number))
         elif self.kind == "random walk":
             change = self._walk(time, pixels, rng)
@@ -124,6 +125,7 @@ def heating(time: Array, start: float, stop: float, time_constant: npt.ArrayLike
     increasing(time, "a heating")
     constant = planck.require_positive("time_constant [s]", time_constant)
     elapsed = (time - time[0]).reshape(-1, *(1,) * constant.ndim)
+    # expm1 keeps the digits of a capture that is short against the time constant.
     rise = np.expm1(-elapsed / constant) / np.expm1(-elapsed[-1] / constant)
     return np.asarray(start + (stop - start) * rise)
 
@@ -260,11 +262,13 @@ def walkers(
     # Background: each person crosses the view once.
     places = np.arange(crossings) + rng.random(crossings)
     for start in time[0] + (time[-1] - time[0]) * places / crossings:
+        # In either direction, from beyond the edge of the view.
         pace = rng.choice([-1.0, 1.0]) * rng.uniform(0.6, 1.2)
         centre = np.sign(pace) * -1.6 + pace * (time - start)
         half = 0.30  # of the body's width
         visible = np.flatnonzero(np.abs(centre) < 1.0 + half)  # frames with the body in view
         distance = columns - centre[visible, np.newaxis, np.newaxis]
+        # An ellipse each, in units of half the view.
         body = (distance / half) ** 2 + ((rows - 0.55) / 0.75) ** 2 < 1
         head = (distance / 0.14) ** 2 + ((rows + 0.35) / 0.2) ** 2 < 1
         cold[visible] = np.where(body | head, skin, cold[visible])
