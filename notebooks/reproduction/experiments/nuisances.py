@@ -133,7 +133,7 @@ def parallax(
         )
     # People walking by: a margin around the view, and several columns a pixel.
     value = xr.DataArray(list(GLASS), dims="band", coords={"band": list(Rig().bands)})
-    time, known = np.arange(int(clock[0])) / clock[1], Rig().response()
+    time, response = np.arange(int(clock[0])) / clock[1], Rig().response()
     height, width = (size + 2 * _MARGIN for size in shape)
     rng = np.random.default_rng(seed)
     wide = simulation.walkers(time, (height, width * COLUMNS), value, rng)
@@ -142,14 +142,14 @@ def parallax(
         mirrored = _view(wide, (right + more, down))["background_temperature"]
         second = _view(wide, (right, down)).assign(background_temperature=mirrored)
         rng = np.random.default_rng(seed + 1)
-        captures.append(disturbances.by_cameras((first, second), known, rng))
+        captures.append(disturbances.by_cameras((first, second), response, rng))
     capture, single = captures
     estimate = alignment.register(capture, model="translation")
     true = estimate.copy(data=np.stack([np.eye(3), np.eye(3)]))
     true[1, :2, 2] = -np.array(shift)
     align = partial(alignment.align, capture, offset=0.0)
     captures = [align(transform=estimate), align(transform=true), single]
-    result = _compare(first, captures, known, VIEWS)
+    result = _compare(first, captures, response, VIEWS)
     away = float(np.hypot(*(estimate - true).values[1, :2, 2]))
     return result.assign(misregistered=((), away, {"units": "pixel"}))
 
