@@ -17,8 +17,7 @@ from dbthermal import response as responses
 from dbthermal._arrays import made_on_disk, on_disk
 from dbthermal.alignment import _joint, align, register
 from dbthermal.alignment._planes import Scale, share_displaced
-from dbthermal.alignment._resampling import on_one_clock
-from dbthermal.alignment._views import registered
+from dbthermal.alignment._resampling import on_one_clock, registered
 from dbthermal.correction import correct_capture
 from dbthermal.separation import separate
 from dbthermal.separation._inputs import decide_noise

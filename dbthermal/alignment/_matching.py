@@ -13,9 +13,8 @@ from scipy.ndimage import gaussian_filter
 
 from dbthermal import _smooth as smooth
 from dbthermal._arrays import Array, Mask
-from dbthermal.alignment import _products as images
-from dbthermal.alignment._field import Field, Information, Spline
-from dbthermal.alignment._products import Movie
+from dbthermal.alignment import _splines as images
+from dbthermal.alignment._splines import Field, Information, Movie, Spline
 from dbthermal.noise import MAD
 
 WINDOW: Final = 2.5

@@ -182,8 +182,8 @@ def _offset(pair: xr.Dataset, signals: Array, stamps: Array, search: int) -> tup
     std = np.sqrt((_GROUPS - 1) * np.var(delays[1:]))
     if not std <= _PRECISION:
         rule = f"within {_PRECISION}: too little moves, or in too few pixels; give offset= [s]"
-        found = f"{delays[0]:.2f} +- {std:.2f} frames"
-        raise ValueError(f"Invalid time offset {label}: {found}. Must be known {rule}.")
+        estimate = f"{delays[0]:.2f} +- {std:.2f} frames"
+        raise ValueError(f"Invalid time offset {label}: {estimate}. Must be known {rule}.")
     period = clocks.frame_period(shared.times)
     return float(delays[0] * period), float(std * period)
 
@@ -332,9 +332,9 @@ def _peak(cross: Array, label: str) -> int:
             "right, search farther by search= [frame], or give offset= [s] beyond the times."
         )
     if abs(lag) == middle - 2:
-        found = f"the largest covariance is at {lag} frames, the end of the search"
+        peak = f"the largest covariance is at {lag} frames, the end of the search"
         rule = "Must lie inside: search farther by search= [frame]"
-        raise ValueError(f"Invalid time offset {label}: {found}. {rule}.")
+        raise ValueError(f"Invalid time offset {label}: {peak}. {rule}.")
     return lag
 
 

@@ -21,9 +21,9 @@ from dbthermal import response as responses
 from dbthermal import schema
 from dbthermal._arrays import Array, Mask, stride
 from dbthermal.alignment import _clocks as clocks
-from dbthermal.alignment import _products as images
+from dbthermal.alignment import _splines as images
 from dbthermal.alignment._offset import noise_levels, sample
-from dbthermal.alignment._products import Movie
+from dbthermal.alignment._splines import Movie
 
 SMALLEST: Final = 24
 """Rows and columns of an image whose bands are matched, at least."""

@@ -13,10 +13,9 @@ from dbthermal import schema
 from dbthermal._arrays import Array, Mask
 from dbthermal.alignment import _matching as matching
 from dbthermal.alignment import _planes as planes
-from dbthermal.alignment._field import Field, Information, Spline
 from dbthermal.alignment._matching import Movies
 from dbthermal.alignment._planes import Capture, Scale
-from dbthermal.alignment._products import Movie, binned
+from dbthermal.alignment._splines import Field, Information, Movie, Spline, binned
 
 _COARSE: Final = 28  # pixels along the shorter side of the coarsest image, at least
 _FEW: Final = 64  # functions of time on the coarsest image

@@ -11,8 +11,8 @@ from dbthermal import schema
 from dbthermal._arrays import Array, Mask
 from dbthermal._smooth import polynomial_basis
 from dbthermal.alignment import _clocks as clocks
-from dbthermal.alignment._products import sampled
-from dbthermal.alignment._views import TRANSFORM, positions
+from dbthermal.alignment._resampling import TRANSFORM, positions
+from dbthermal.alignment._splines import sampled
 from dbthermal.noise import MAD
 
 # Entries of a homography that each kind of transform changes.

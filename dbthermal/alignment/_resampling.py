@@ -1,20 +1,189 @@
-"""Resampling of all bands onto one clock, of views on one pixel grid (`_views`)."""
+"""Resampling of all bands: views onto one pixel grid by polynomials, and onto one clock."""
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 import xarray as xr
+from scipy.sparse import csr_array, diags_array, eye_array
 
 from dbthermal import _numbers, _rows, schema
-from dbthermal._arrays import Array
+from dbthermal._arrays import Array, Mask
+from dbthermal._coordinates import laid_on
 from dbthermal._warnings import warned
 from dbthermal.alignment import _clocks as clocks
-from dbthermal.alignment import _views as views
 from dbthermal.alignment._offset import SEARCH, noise_levels, require_one_clock, sample, time_offset
-from dbthermal.alignment._products import Movie
+from dbthermal.alignment._splines import Movie
 
+TRANSFORM: Final = schema.Variable(
+    ("band", "row", "column"), "float64", "1", "pixel of the first view to pixel of this one"
+)
+"""Transform of `register`: for each band a 3x3 homography on (x, y, 1), in pixels."""
+
+MAP: Final = schema.Variable(
+    ("band", "axis", "y", "x"), "float64", "pixel", "row and column of the first view's pixel here"
+)
+"""Transform of a curved surface: for each band where each pixel of the first view lies in it."""
+
+TAPS: Final = 6  # pixels a side that a sample between pixels is made of
+_ROUNDING: Final = 1e-7  # weights that are rounding [1]
+_BEYOND: Final = 0.1  # distance from the last pixel's centre at which its line holds [pixel]
+_DIGITS: Final = 9  # of a rounded position, so that a border met exactly counts [pixel]
 STEP: Final = 5.0  # standard deviations of noise of a step between two frames
+
+
+def registered(corrected: xr.Dataset, transform: xr.DataArray, *, lazy: bool) -> xr.Dataset:
+    """Capture with all views on the first one's grid, each band on its own clock."""
+    result, shares = moved(corrected, _maps(transform, corrected), lazy=lazy)
+    factors = shares * schema.noise_factor(corrected)
+    result = result.assign(noise_factor=("band", factors, schema.NOISE_FACTOR.attrs))
+    if "pattern_std" in result:
+        result["pattern_std"] = result["pattern_std"] * shares
+        result["pattern_std"].attrs.update(schema.PATTERN_STD.attrs)
+    if "row" in transform.dims:
+        names = [str(name) for name in corrected["band"].values]
+        places = schema.band_positions(transform, names, "the transform")
+        result.attrs["transform"] = transform.values[places].ravel().tolist()
+    return result
+
+
+def moved(corrected: xr.Dataset, maps: Sequence[Array], *, lazy: bool) -> tuple[xr.Dataset, Array]:
+    """Views and status at other rows and columns, and the factor of each band's noise."""
+    counts, status = corrected["counts"], corrected.get("status")
+    flags = np.zeros(counts.shape[2:], dtype=np.uint8) if status is None else status.values
+    weights = [_weights(places, flags > 0) for places in maps]
+
+    def views(rows: slice) -> Movie:
+        """Rows of all bands."""
+        pairs = zip(counts, weights, strict=True)
+        return np.stack([_warped(view, matrix, rows) for view, matrix in pairs])
+
+    warped = _rows.lazy(views, counts) if lazy else counts.copy(data=views(slice(None)))
+    result = corrected.assign(counts=warped)
+    if status is not None:
+        result = result.assign(status=status.copy(data=_warped_status(flags, weights)))
+    # Root mean square over the image, for pixels of independent noise.
+    squares = [(matrix**2).sum(axis=1)[np.diff(matrix.indptr) > 0] for matrix in weights]
+    return result, np.sqrt([np.mean(matrix) if matrix.size else 1.0 for matrix in squares])
+
+
+def reflected(field: xr.Dataset, corrected: xr.Dataset) -> list[Array]:
+    """Rows and columns (2, y, x) of one reflection in each band; NaN where it is unknown."""
+    field = laid_on(field, corrected, "the reflection shift", "the capture")
+    pixels = np.indices(corrected["counts"].shape[2:], dtype=np.float64)
+    place = pixels + field["shift"].where(field["known"]).transpose("axis", "y", "x").values
+    reference = str(field.attrs["reference_band"])
+    return [place if str(band) == reference else pixels for band in corrected["band"].values]
+
+
+def interpolation(places: Array, taps: int) -> csr_array:
+    """Weights (pixel, pixel) [1] of samples at rows and columns (2, y, x) [pixel].
+
+    Of Lagrange polynomials through `taps` neighbours a side: half-way between pixels 6 of them keep
+    95 % of a wave of four pixels and 99.7 % of seven, lines keep 71 and 90 %. A place without so
+    many neighbours has no weights, but for `_BEYOND`.
+    """
+    shape, complete, factors = places.shape[1:], np.ones(places[0].size, dtype=bool), []
+    for place, size in zip(places.reshape(2, -1), shape, strict=True):
+        within, first, weight = lagrange(place, size, taps)
+        complete &= within
+        factors.append((weight, first[:, np.newaxis] + np.arange(taps, dtype=np.int32)))
+    (down, row), (right, column) = factors
+    weight = (down[:, :, np.newaxis] * right[:, np.newaxis]).astype(np.float32)
+    pixel = row[:, :, np.newaxis] * shape[1] + column[:, np.newaxis]
+    kept = complete[:, np.newaxis, np.newaxis] & (abs(weight) > _ROUNDING)
+    ends = np.concatenate([[0], np.cumsum(kept.sum(axis=(1, 2)))])
+    return csr_array((weight[kept], pixel[kept], ends), shape=(complete.size, complete.size))
+
+
+def lagrange(place: Array, size: int, taps: int) -> tuple[Mask, npt.NDArray[np.int32], Array]:
+    """Positions with enough neighbours on a line of pixels, the first one, and all weights."""
+    nodes = np.arange(taps)
+    spacing = nodes[:, np.newaxis] - nodes + np.eye(taps)
+    complete = (place >= taps // 2 - 1 - _BEYOND) & (place <= size - taps // 2 + _BEYOND)
+    position = np.where(complete, place, 0.0)
+    first = np.clip(np.floor(position) - (taps // 2 - 1), 0, size - taps)
+    away = (position - first)[:, np.newaxis] - nodes
+    factors = np.where(np.eye(taps, dtype=bool), 1.0, away[:, np.newaxis, :])
+    return complete, first.astype(np.int32), np.prod(factors / spacing, axis=2)
+
+
+def positions(matrix: Array, shape: tuple[int, ...]) -> Array:
+    r"""Row and column (2, y, x) [pixel], in another view, of the pixels of the first.
+
+    .. math:: (x', y', 1)^T \propto H (x, y, 1)^T, counted from 0 at the centre of the first pixel.
+    """
+    rows, columns = np.indices(shape, dtype=np.float64)
+    points = np.stack([columns, rows, np.ones_like(rows)])
+    column, row, scale = np.einsum("ij,jyx->iyx", matrix, points)
+    scale = np.where(scale * matrix[2, 2] > 0, scale, np.nan)  # else behind the camera
+    return np.asarray(np.round(np.stack([row, column]) / scale, _DIGITS))
+
+
+def single(counts: npt.NDArray[Any]) -> Movie:
+    """Counts in single precision, NaN where they are infinite or beyond it."""
+    return np.where(schema.measured(counts), counts, np.nan).astype(np.float32, copy=False)
+
+
+def _maps(transform: xr.DataArray, corrected: xr.Dataset) -> list[Array]:
+    """Rows and columns (2, y, x) in each view of the first one's pixels, in the capture's order."""
+    names = [str(name) for name in corrected["band"].values]
+    shape = corrected["counts"].shape[2:]
+    array = schema.check_numbers(transform, "transform")
+    expected = MAP if "axis" in array.dims else TRANSFORM
+    schema.check_variable(transform, expected, "the transform")
+    values = transform.values[schema.band_positions(transform, names, "the transform")]
+    if expected is MAP:
+        if values.shape[1:] != (2, *shape):
+            rule = f"Must be {(2, *shape)} in each band, as the image"
+            raise ValueError(f"Invalid transform of shape {values.shape[1:]}. {rule}.")
+        return [*values.astype(np.float64)]
+    if values.shape[1:] != (3, 3) or not np.all(np.isfinite(values)):
+        rule = "Must be 3x3 and finite in each band"
+        raise ValueError(f"Invalid transform of shape {values.shape}. {rule}.")
+    return [positions(matrix, shape) for matrix in values.astype(np.float64)]
+
+
+def _weights(places: Array, bad: Mask) -> csr_array:
+    """Weights as `interpolation`, of lines near the border and near bad pixels."""
+    if np.array_equal(places, np.indices(bad.shape)):
+        return eye_array(bad.size, dtype=np.float32, format="csr")
+    fine = interpolation(places, TAPS)
+    near = (np.diff(fine.indptr) == 0) | (abs(fine) @ bad.ravel().astype(np.float32) > 0)
+    coarse = interpolation(places, 2)
+    keep, swap = (diags_array(rows.astype(np.float32)) for rows in (~near, near))
+    result = csr_array(keep @ fine + swap @ coarse)
+    result.eliminate_zeros()  # for a weight of 0 would pass a NaN on
+    return result
+
+
+def _warped(view: xr.DataArray, weights: csr_array, rows: slice) -> Movie:
+    """Some rows (time, y, x) of the first view's pixels; NaN outside the view."""
+    height, width = view.shape[1:]
+    top, end, _ = rows.indices(height)
+    block = csr_array(weights[top * width : end * width])
+    result = np.full((len(view), end - top, width), np.nan, dtype=np.float32)
+    if block.nnz == 0:
+        return result
+    first, last = block.indices.min() // width, block.indices.max() // width
+    block = csr_array(block[:, first * width : (last + 1) * width])
+    frames = single(view.isel(y=slice(first, last + 1)).values)
+    covered = np.diff(block.indptr).reshape(end - top, width) > 0
+    for frame, out in zip(frames, result, strict=True):
+        out[covered] = (block @ frame.ravel()).reshape(covered.shape)[covered]
+    return result
+
+
+def _warped_status(flags: npt.NDArray[Any], weights: Sequence[csr_array]) -> npt.NDArray[Any]:
+    """Bits (y, x) of every pixel that a warped one may be made of, in any of the views."""
+    result = np.zeros_like(flags)
+    for value in np.unique(flags[flags > 0]):
+        bad = (flags == value).ravel().astype(np.float32)
+        for matrix in weights:
+            result[(abs(matrix) @ bad).reshape(flags.shape) > 0] |= value
+    return result
 
 
 def on_one_clock(
@@ -33,7 +202,7 @@ def on_one_clock(
     if reflection_shift is not None:
         schema.check(reflection_shift, "reflection_shift")
     if reflection_shift is not None and offset is None:
-        alike, _ = views.moved(corrected, views.reflected(reflection_shift, corrected), lazy=lazy)
+        alike, _ = moved(corrected, reflected(reflection_shift, corrected), lazy=lazy)
     offsets = _offsets(alike, offset, names, search)
     stamps = clocks.exposure_times(corrected) + offsets[:, np.newaxis]
     signals = sample(corrected)
@@ -50,7 +219,7 @@ def on_one_clock(
     plans, factors = [], np.ones(len(names))
     # Frames that are NaN, or a copy of the one before, in every block of rows.
     blocks = (counts.isel(y=rows).values for rows in _rows.blocks(counts.shape))
-    copies = [[clocks.missing(views.single(film)) for film in block] for block in blocks]
+    copies = [[clocks.missing(single(film)) for film in block] for block in blocks]
     missing = np.all(copies, axis=0)
     for band, (row, absent) in enumerate(zip(stamps, missing, strict=True)):
         plan = clocks.interpolation(row, ~absent, times, segment, clocks.growth(signals[band]))
@@ -63,7 +232,7 @@ def on_one_clock(
         movies = counts.isel(y=rows)
         result = np.empty(movies.shape, dtype=np.float32)
         for band, plan in enumerate(plans):
-            movie = views.single(movies.isel(band=band).values)
+            movie = single(movies.isel(band=band).values)
             if missing[band].any():
                 movie = np.where(missing[band][:, None, None], np.float32(np.nan), movie)
             # The largest step of noise: a difference less the mean of its two neighbours.

@@ -169,7 +169,7 @@ def fit_response(  # noqa: PLR0913 - what is known of blackbody and cameras, by 
         scatter = np.sqrt((result["residual"].values ** 2).mean(axis=1)) / slopes
         offset_std = np.hypot(ACCURACY["offset_std"], scatter).tolist()
     drifts = {"offset_std": offset_std, "gain_std": gain_std, "pattern_std": pattern_std}
-    known: dict[str, Any] = {
+    accuracies: dict[str, Any] = {
         **drifts,
         "blackbody_accuracy": blackbody_accuracy,
         "blackbody_emissivity": blackbody_emissivity,
@@ -177,12 +177,12 @@ def fit_response(  # noqa: PLR0913 - what is known of blackbody and cameras, by 
         "background_ratio_std": background_ratio_std,
     }
     for name in drifts:
-        values = _numbers.real_numbers(name, known[name])
+        values = _numbers.real_numbers(name, accuracies[name])
         if values.shape not in {(), (1,), (len(names),)}:
             rule = f"Must be one for all bands, or {len(names)}"
             raise ValueError(f"Invalid {name} of shape {values.shape}. {rule}.")
-        known[name] = np.broadcast_to(values, len(names)).copy()
-    result = result.assign(schema.variables("response", known))
+        accuracies[name] = np.broadcast_to(values, len(names)).copy()
+    result = result.assign(schema.variables("response", accuracies))
     responses.accuracy(result, names)  # refuses what is none
     stated += f", of all {blackbody_accuracy:g} K, emissivity {blackbody_emissivity:g}"
     result.attrs["blackbody"] = f"{temperature.size} temperatures of {celsius} degC; {stated}"

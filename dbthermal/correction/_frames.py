@@ -154,10 +154,10 @@ def _leave_out(
         (frames,) = np.nonzero(valid[band])
         for start, stop, places in _runs(film[frames], limit, longest):
             trio, span = frames[places], frames[[start, stop - 1]]
-            alone = any(kind[trio[0]] > kind[trio[1:]].max() for kind in (uniform, random))
+            no_scene = any(kind[trio[0]] > kind[trio[1:]].max() for kind in (uniform, random))
             if not valid[band, frames[start:stop]].all():
                 continue
-            if alone or not _is_shared(sections, valid, band, trio, span):
+            if no_scene or not _is_shared(sections, valid, band, trio, span):
                 valid[band, frames[start:stop]] = False
                 if not uniform[trio[0]]:
                     continue

@@ -244,16 +244,16 @@ def _measured(movie: xr.DataArray, rows: slice, columns: slice) -> Single:
 def _jumps(movie: xr.DataArray, limit: Array, stepped: Mask, reach: int) -> Mask:
     """Pixels (y, x) that change by more than their limit [count] while no neighbour does."""
     jumping = np.zeros(limit.shape, dtype=bool)
-    for window in _rows.windows(movie.shape, _BLOCK):
-        # Include neighbours on every side.
-        (top, left), (bottom, right) = zip(*((it.start, it.stop) for it in window), strict=True)
-        wide = slice(max(top - 1, 0), bottom + 1), slice(max(left - 1, 0), right + 1)
-        inner = np.s_[top - wide[0].start :, left - wide[1].start :]
+    for rows, columns in _rows.windows(movie.shape, _BLOCK):
+        # A pixel at the edge of a block needs its neighbours in the next one.
+        top, start = max(rows.start - 1, 0), max(columns.start - 1, 0)
+        wide = slice(top, rows.stop + 1), slice(start, columns.stop + 1)
+        inner = slice(rows.start - top, rows.stop - top), slice(columns.start - start, None)
         changes = _changes(_measured(movie, *wide), stepped)
         for sign in (1.0, -1.0):
             change, total = (np.float32(sign) * difference for difference in changes)
-            alone = _alone(change, total, limit[wide], reach)[inner]
-            jumping[window] |= alone[: bottom - top, : right - left]
+            isolated = _isolated(change, total, limit[wide], reach)[inner]
+            jumping[rows, columns] |= isolated[:, : columns.stop - columns.start]
     return jumping
 
 
@@ -274,7 +274,7 @@ def _changes(signal: Single, stepped: Mask) -> tuple[Single, Single]:
     return np.where(gap > _LONGEST_GAP + 1, np.float32(0.0), change / gap), change
 
 
-def _alone(change: Single, total: Single, limit: Array, reach: int) -> Mask:
+def _isolated(change: Single, total: Single, limit: Array, reach: int) -> Mask:
     """Pixels (y, x) that jump by more than their limit in a frame in which no neighbour does."""
     nearby = maximum_filter1d(total, 2 * reach + 1, axis=0, mode="constant")
     nearby, (rows, columns) = np.pad(nearby, ((0, 0), (1, 1), (1, 1))), limit.shape

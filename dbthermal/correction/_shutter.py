@@ -182,16 +182,16 @@ def distinct(capture: xr.Dataset) -> tuple[xr.Dataset, Mask]:
     least = np.repeat(least, numbers[slowest]) * shown[slowest]
     kept = np.flatnonzero((place % shown[slowest] == 0) & (place < least))
     first, result = first[:, kept], capture.isel(time=kept)
-    again = np.diff(first, axis=1, prepend=-1) == 0
-    if np.any((first != kept) & ~again):
+    duplicate = np.diff(first, axis=1, prepend=-1) == 0
+    if np.any((first != kept) & ~duplicate):
         even = capture["time"].astype(np.float64).expand_dims(band=counts["band"])
         stamps = np.take_along_axis(capture.get("exposure_time", even).values, first, axis=1)
-        stamps = np.where(again, np.nan, stamps)
+        stamps = np.where(duplicate, np.nan, stamps)
         result = result.assign(exposure_time=(("band", "time"), stamps, schema.EXPOSURE_TIME.attrs))
     pairs = zip(counts["band"].values, shown, strict=True)
     label = ", ".join(f"{number} times in band '{band}'" for band, number in pairs if number > 1)
     said = f"Each frame is repeated, {label}: a stream faster than its sensor. One of each is kept"
-    return warned(result, said), again
+    return warned(result, said), duplicate
 
 
 def copies(counts: xr.DataArray) -> Mask:

@@ -2,10 +2,10 @@
 
 Begin with a `session`, a YAML file of the recording and its devices' addresses; `devices` opens
 them, `protocols` records a scene or a blackbody sweep, `live` shows it meanwhile, and `recording`
-opens it again. `inventory` lists what is on the USB bus. The drivers are `boson` over `_fslp`
-and `telemetry`, `filterwheel` over `_apt`, `tc08`, and `v4l2` for frames; `camera` is the interface
-of any camera, `transport` has addresses, serial lines and the clock. `emulated` has emulated
-devices, below the same drivers.
+opens it again. `inventory` lists what is on the USB bus. The drivers are `boson` with `telemetry`,
+`filterwheel` over `_apt`, `tc08`, and `v4l2` for frames; `camera` is the interface of any camera,
+`transport` has addresses, serial lines and the clock. `emulated` has emulated devices, below the
+same drivers.
 
 All drivers were written from public descriptions and tested against public byte vectors, stand-ins
 for the system's calls and emulators, **never against hardware**. They need the packages of

@@ -1,4 +1,7 @@
-"""FLIR Boson: driver of the camera's command port, and the commands that it sends.
+"""FLIR Boson: driver of the camera's command port, the commands that it sends, and their bytes.
+
+A frame of the serial line (FSLP) is the start byte 8E, then channel, sequence number, command,
+status, data and checksum, big-endian and with three byte values escaped, then the end byte AE.
 
 A busy camera answers late; without sequence numbers every later command then gets the reply of the
 command before (openmv/openmv, pull request 3265). Here each request has a new number, and frames
@@ -7,10 +10,13 @@ camera's flash memory. `KIND` opens camera and command port for a session.
 
 References
 ----------
-Identifiers, enumerations and status codes: openmv/openmv, ``drivers/boson/include`` (commit
-cbbb877). Facts alone, none of the vendor's text or code.
+Facts alone, none of the vendor's text or code: openmv/openmv, ``drivers/boson`` (commit cbbb877,
+identifiers, enumerations, status codes); FLIR/rawBoson, ``rawBoson.c`` (commit 0f192d6); frames in
+thurberdog/ghostCommand (commit 35dc641) and in LJMUAstroecology/flirpy issue 21.
 """
 
+import binascii
+import re
 import struct
 import threading
 from collections.abc import Callable
@@ -22,7 +28,7 @@ from typing import Any, Final, Generic, TypeVar
 
 from scipy.constants import zero_Celsius
 
-from dbthermal.instruments import _fslp, telemetry, v4l2
+from dbthermal.instruments import telemetry, v4l2
 from dbthermal.instruments.camera import CameraKind, FfcMode, FfcStatus, GainMode, Identity
 from dbthermal.instruments.transport import Closing, Transport
 
@@ -36,6 +42,16 @@ FFC_TIMEOUT: Final = 10.0  # longest wait for a flat-field correction [s]
 POLL: Final = 0.05  # time between two questions while waiting [s]
 MAXIMUM_RECEIVED: Final = 65536  # most bytes to search for one reply: some lines talk without end
 _READ_SIZE: Final = 4096
+COMMAND_CHANNEL: Final = 0x00  # of commands and replies; frames of all others are ignored
+REQUEST: Final = 0xFFFFFFFF  # status of a request; that of a reply is 0 or an error code
+MAXIMUM_DATA: Final = 751  # most bytes of data in a frame to send, as in FLIR/rawBoson
+MAXIMUM_FRAME: Final = 2048  # most unescaped bytes received: the buffer of the vendor's receiver
+_START, _END, _ESCAPE = b"\x8e", b"\xae", b"\x9e"
+_SPECIAL = _START + _END + _ESCAPE
+_SHIFT = 0x0D  # an escaped byte is sent as the escape byte and the value less this
+_ESCAPED = re.compile(rb"\x9e[\x81\x91\xa1]")
+_HEADER = struct.Struct(">BIII")
+_CHECKSUM = struct.Struct(">H")
 
 T = TypeVar("T")
 EnumT = TypeVar("EnumT", bound=IntEnum)
@@ -108,9 +124,8 @@ IR16_MODE: Final = Setting("IR16 mode", 0x000E000D, Ir16Mode)
 TELEMETRY: Final = Setting("telemetry", 0x00040001, Switch)
 TELEMETRY_LOCATION: Final = Setting("telemetry location", 0x00040003, TelemetryLocation)
 
-SETTINGS: Final[tuple[Setting[Any], ...]] = (
-    *(FFC_MODE, GAIN_MODE, IR16_MODE, TELEMETRY, TELEMETRY_LOCATION),
-)
+_MODES = FFC_MODE, GAIN_MODE, IR16_MODE, TELEMETRY, TELEMETRY_LOCATION
+SETTINGS: Final[tuple[Setting[Any], ...]] = _MODES
 RUN_FFC: Final = 0x00050007  # command that starts a flat-field correction
 
 # Meaning of each status of a refusal.
@@ -141,6 +156,91 @@ STATUSES: Final = MappingProxyType(
         **dict.fromkeys(range(0x6A4, 0x6AE), "flash error"),
     }
 )
+
+
+@dataclass(frozen=True)
+class Packet:
+    """An undamaged frame."""
+
+    channel: int  # `COMMAND_CHANNEL`, or that of debug text and other traffic, 0 to 255
+    sequence: int  # number of the request, echoed by its reply, unsigned, 32 bits
+    command: int  # identifier of the function, unsigned, 32 bits
+    status: int  # `REQUEST`, or of a reply 0 for success, else an error code
+    data: bytes = b""  # arguments or result of the function; empty in error replies
+
+
+def checksum(content: bytes) -> int:
+    """CRC-16/AUG-CCITT (SPI-FUJITSU) of an unescaped frame, from channel to data."""
+    return binascii.crc_hqx(content, 0x1D0F)
+
+
+def encode(frame: Packet) -> bytes:
+    """Bytes of a frame; header, data and checksum are all escaped.
+
+    ValueError if the data are too long, struct.error if a number does not fit its field.
+    """
+    if (size := len(frame.data)) > MAXIMUM_DATA:
+        raise ValueError(f"Invalid data of {size} bytes. Must be at most {MAXIMUM_DATA}.")
+    content = _HEADER.pack(frame.channel, frame.sequence, frame.command, frame.status) + frame.data
+    content += _CHECKSUM.pack(checksum(content))
+    pieces = (_ESCAPE + bytes((v - _SHIFT,)) if v in _SPECIAL else bytes((v,)) for v in content)
+    return _START + b"".join(pieces) + _END
+
+
+def next_sequence(sequence: int) -> int:
+    """Next larger sequence number without a byte that would be escaped; 0 after the largest."""
+    following = ((sequence + 1) % (1 << 32)).to_bytes(4, "big")
+    for position, value in enumerate(following):
+        if value in _SPECIAL:  # the least number above: the bytes behind start from zero
+            raised = following[:position] + bytes([value + 1]) + bytes(3 - position)
+            return int.from_bytes(raised, "big")
+    return int.from_bytes(following, "big")
+
+
+class Decoder:
+    """Finds the frames in a stream of bytes, however it is cut into pieces.
+
+    Bytes between frames are ignored. A start byte always begins anew. A frame that is cut short,
+    too long or too short, holds an illegal escape or has the wrong checksum is dropped and counted
+    in `damaged`: each start byte began a frame that was returned, is counted, or is still open.
+    """
+
+    def __init__(self) -> None:
+        self.damaged = 0
+        self._content: bytes | None = None  # since the last start byte; None between frames
+
+    @property
+    def is_open(self) -> bool:
+        """True if a frame has begun and not yet ended."""
+        return self._content is not None
+
+    def feed(self, received: bytes) -> list[Packet]:
+        """Take in any number of bytes; return the undamaged frames that they complete."""
+        frames = []
+        for number, piece in enumerate(bytes(received).split(_START)):
+            if number:  # a start byte came before it
+                self.damaged += self.is_open
+                self._content = b""
+            if self._content is None:
+                continue
+            self._content, end, _ = (self._content + piece).partition(_END)
+            if end or len(self._content) > 2 * MAXIMUM_FRAME:  # each byte may be escaped
+                frame, self._content = _frame(self._content), None
+                frames += [frame] if frame else []
+                self.damaged += frame is None
+        return frames
+
+
+def _frame(escaped: bytes) -> Packet | None:
+    """Packet of the bytes between start and end; None if it is damaged."""
+    content = _ESCAPED.sub(lambda pair: bytes((pair[0][1] + _SHIFT,)), escaped)
+    body, sent = content[: -_CHECKSUM.size], content[-_CHECKSUM.size :]
+    if _ESCAPE in _ESCAPED.sub(b"", escaped) or not _HEADER.size <= len(body) < MAXIMUM_FRAME - 1:
+        return None
+    if _CHECKSUM.pack(checksum(body)) != sent:
+        return None
+    channel, sequence, command, status = _HEADER.unpack_from(body)
+    return Packet(channel, sequence, command, status, body[_HEADER.size :])
 
 
 class BosonError(RuntimeError):
@@ -174,7 +274,7 @@ class Boson(Closing):
         first = moment if first_sequence is None else first_sequence
         self.is_simulated = transport.is_simulated
         self._transport, self._clock = transport, transport.clock
-        self._decoder = _fslp.Decoder()
+        self._decoder = Decoder()
         self._sequence = (first - 1) % (1 << 32)
         self._lock = threading.Lock()
 
@@ -280,10 +380,10 @@ class Boson(Closing):
         """Send a request, again under a new number if no reply comes; return the reply's data."""
         for _ in range(repeats + 1):
             with self._clock.hold(self._lock):
-                self._sequence = _fslp.next_sequence(self._sequence)
-                number, status = self._sequence, _fslp.REQUEST
-                request = _fslp.Frame(_fslp.COMMAND_CHANNEL, number, command, status, data)
-                self._transport.write(_fslp.encode(request))
+                self._sequence = next_sequence(self._sequence)
+                number, status = self._sequence, REQUEST
+                request = Packet(COMMAND_CHANNEL, number, command, status, data)
+                self._transport.write(encode(request))
                 if reply := self._reply(name):
                     break
         else:
@@ -299,9 +399,9 @@ class Boson(Closing):
             raise BosonError(f"{label}. Must be 0, OK.")
         return reply.data
 
-    def _reply(self, name: str) -> _fslp.Frame | None:
+    def _reply(self, name: str) -> Packet | None:
         """Reply to the last request, None if it does not come in time; other frames are ignored."""
-        key = (_fslp.COMMAND_CHANNEL, self._sequence)
+        key = (COMMAND_CHANNEL, self._sequence)
         deadline, received = self._clock() + REPLY_TIMEOUT, 0
         while (remaining := deadline - self._clock()) > 0:
             if not (piece := self._transport.read(_READ_SIZE, remaining)):
@@ -311,7 +411,7 @@ class Boson(Closing):
                 rule = "Must be a Boson's command port that no other program uses"
                 raise BosonError(f"No reply to '{name}' within {MAXIMUM_RECEIVED} bytes. {rule}.")
             for frame in self._decoder.feed(piece):
-                if (frame.channel, frame.sequence) == key and frame.status != _fslp.REQUEST:
+                if (frame.channel, frame.sequence) == key and frame.status != REQUEST:
                     return frame
         return None
 

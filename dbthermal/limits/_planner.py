@@ -148,6 +148,7 @@ def plan(
         sensitivity = truth.smoothed(order).sensitivity(behind, noises)
         stds = deviations(sensitivity, truth.time, order, reference=0)
         for name in TEMPERATURES:
+            # One number for all frames: the root of their mean square.
             stds[name] = np.sqrt(np.mean(stds[name] ** 2, axis=0))
         stds["condition_number"] = mixing.condition_number(truth.emissivity.T)
         cases.append(stds)

@@ -32,7 +32,7 @@ import xarray as xr
 from dbthermal import response as responses
 from dbthermal import schema
 from dbthermal._arrays import Array, empty, release
-from dbthermal.emissivity._background import Colour
+from dbthermal.emissivity import Colour
 from dbthermal.response import Accuracy
 from dbthermal.schema import BUDGETS, CALIBRATION, CAUSES
 from dbthermal.separation._inputs import Inputs

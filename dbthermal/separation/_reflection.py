@@ -7,7 +7,7 @@ import numpy as np
 import xarray as xr
 
 from dbthermal._arrays import Array, empty, release
-from dbthermal.emissivity._background import Colour
+from dbthermal.emissivity import Colour
 
 if TYPE_CHECKING:
     from dbthermal.separation._separate import Measured

@@ -17,7 +17,7 @@ from dbthermal._warnings import warned
 from dbthermal.alignment._planes import Scale, share_displaced
 from dbthermal.alignment._reflections import seen_apart
 from dbthermal.bands import FILTERS
-from dbthermal.emissivity._background import colour_of
+from dbthermal.emissivity import colour_of
 from dbthermal.schema import Status
 from dbthermal.separation import _budget as budget
 from dbthermal.separation import _misfit as misfits

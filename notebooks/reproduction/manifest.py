@@ -8,18 +8,17 @@ and from no other scheme. Every path from this module is of a file whose SHA-256
 just been compared.
 """
 
-import re
 import sys
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, TypeAlias
 from urllib.parse import quote, urljoin, urlsplit
 
 import pooch
 import requests
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from dbthermal import readers, store
 from reproduction import locked, paths
@@ -30,20 +29,10 @@ _TIMEOUT: Final = 30.0  # without a byte [s]
 _SLOWEST: Final = 10_000  # of a whole download, beside one `_TIMEOUT` [byte/s]
 
 
-def _matching(label: str, pattern: str, rule: str) -> AfterValidator:
-    """Validator whose error names what a text is, the text, and the rule."""
-
-    def check(value: Any) -> Any:
-        if not re.fullmatch(pattern, str(value)):
-            raise ValueError(f"Invalid {label} {value!r}. Must {rule}.")
-        return value
-
-    return AfterValidator(check)
-
-
-_ORIGIN: Final = _matching(
-    "origin", r"https?://[^?#@\\\x00-\x1f]+/", "begin with https:// and end in '/'"
-)
+# A name is of a file, and of no folder.
+_Name: TypeAlias = Annotated[str, Field(pattern="^[A-Za-z0-9_][A-Za-z0-9 _.-]{0,199}$")]
+_Folder: TypeAlias = Annotated[str, Field(pattern="^[a-z][a-z0-9_]{0,49}$")]
+_Origin: TypeAlias = Annotated[str, Field(pattern=r"^https?://[^?#@\\\x00-\x1f]+/$")]
 
 
 class File(BaseModel):
@@ -51,20 +40,12 @@ class File(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
-    name: Annotated[
-        str,
-        _matching(
-            "file name",
-            "[A-Za-z0-9_][A-Za-z0-9 _.-]{0,199}",
-            "be letters, digits, '_', '.', '-' and spaces, none of the last three first: it names "
-            "no folder",
-        ),
-    ]
-    sha256: Annotated[str, _matching("sha256", "[0-9a-f]{64}", "be 64 lower-case digits")]
-    bytes: Annotated[int, _matching("size", "[1-9][0-9]*", "be > 0 bytes")]
+    name: _Name
+    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+    bytes: Annotated[int, Field(gt=0)]
     covers_8_14um: bool = True  # False for a spectrum that ends short of 14 um
     thermal_duplicate_of: str | None = None  # file with the same values in the thermal infrared
-    origin: Annotated[str, _ORIGIN] | None = None  # where it is not the collection's
+    origin: _Origin | None = None  # where it is not the collection's
 
 
 def _by_name(entries: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
@@ -80,7 +61,7 @@ class Collection(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     title: str
-    origin: Annotated[str, _ORIGIN]
+    origin: _Origin
     citation: tuple[str, ...]
     terms: str
     used_by: tuple[str, ...]
@@ -98,17 +79,7 @@ class Manifest(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    collections: Mapping[
-        Annotated[
-            str,
-            _matching(
-                "collection",
-                "[a-z][a-z0-9_]{0,49}",
-                "be lower-case letters, digits and '_', a letter first: it names a folder",
-            ),
-        ],
-        Collection,
-    ]
+    collections: Mapping[_Folder, Collection]
 
     def __getitem__(self, name: str) -> Collection:
         """Collection by name; ValueError if it is not listed."""

@@ -18,7 +18,7 @@ import xarray as xr
 from scipy.ndimage import binary_dilation, gaussian_filter
 
 from dbthermal._arrays import Array
-from reproduction import metrics, numbers, palettes, uncalibrated
+from reproduction import numbers, palettes, uncalibrated
 
 BANDS: Final = {"8-14": 0, "9.5": 1}
 """Band and the number in its video's name; the second is published as 9.25-9.75 um."""
@@ -108,17 +108,17 @@ def first_frame(
     for place, band in enumerate(movie.values):
         ours = _changes(band, outline.values)
         for first in range(extra + 1):
-            part = ours[first : first + len(results)]
-            scores[place, first] = np.median(np.abs(np.einsum("tp,tp->t", results, part)))
+            window = ours[first : first + len(results)]
+            scores[place, first] = np.median(np.abs(np.einsum("tp,tp->t", results, window)))
     best = scores[np.argmax(scores.max(axis=1))]
     above = best - np.median(best)
     deviation = 1.4826 * float(np.median(np.abs(above)))
     return int(np.argmax(best)), float(above.max()) / deviation if extra else np.inf
 
 
-def _changes(movie: npt.NDArray[np.floating], inside: npt.NDArray[np.bool_]) -> Array:
+def _changes(movie: npt.NDArray[np.floating], mask: npt.NDArray[np.bool_]) -> Array:
     """Changes (time, pixel) over two frames of pictures without gain and offset, of norm 1."""
-    smoothed = gaussian_filter(movie.astype(np.float64), (0, SMOOTHING, SMOOTHING))[:, inside]
+    smoothed = gaussian_filter(movie.astype(np.float64), (0, SMOOTHING, SMOOTHING))[:, mask]
     frames = _normalised(smoothed)
     return _normalised(frames[_CHANGE:] - frames[:-_CHANGE])
 
@@ -142,7 +142,7 @@ def agreement(
 
     Our reflection (time, y, x), smoothed by `SMOOTHING`, is compared over those of the pixels that
     the authors' map covers in all of these frames. Raises a ValueError if the frames differ in
-    number or size.
+    number or size, or a map is constant or unknown where it is compared.
     """
     if theirs["value"].shape != reflection.shape:
         rule = f"Must be {reflection.shape}"
@@ -150,11 +150,17 @@ def agreement(
     theirs = theirs.assign_coords({dim: reflection[dim] for dim in ("time", "y", "x")})
     ours, theirs = reflection.isel(time=frames), theirs.isel(time=frames)
     # Smoothed within the object alone: its surroundings neither enter nor dim its edge.
-    inside, width = theirs["valid"].values.astype(np.float64), (0.0, SMOOTHING, SMOOTHING)
-    smoothed = gaussian_filter(ours.values * inside, width)
-    weight = gaussian_filter(inside, width)
-    ours = ours.copy(data=np.abs(np.divide(smoothed, weight, where=inside > 0, out=inside)))
-    return metrics.correlation(ours, theirs["value"], theirs["valid"].all("time") & pixels)
+    covering, width = theirs["valid"].values.astype(np.float64), (0.0, SMOOTHING, SMOOTHING)
+    smoothed = gaussian_filter(ours.values * covering, width)
+    weight = gaussian_filter(covering, width)
+    ours = ours.copy(data=np.abs(np.divide(smoothed, weight, where=covering > 0, out=covering)))
+    covered = (theirs["valid"].all("time") & pixels).values
+    pairs = zip(ours.values[:, covered], theirs["value"].values[:, covered], strict=True)
+    with np.errstate(invalid="ignore"):
+        scores = np.array([np.corrcoef(*pair)[0, 1] for pair in pairs])
+    if not np.all(np.isfinite(scores)):
+        raise ValueError("Constant or unknown map where it is compared. Must be known, and vary.")
+    return ours["time"].copy(data=scores)
 
 
 def strongest(reflection: xr.DataArray, outline: xr.DataArray, number: int) -> npt.NDArray[np.intp]:
@@ -189,27 +195,27 @@ def compare(scene: Scene, number: int) -> Comparison:
     reflections = uncalibrated.reflections_shift(undone, scene.outline)
     shared = uncalibrated.shared_outline(scene.outline, reflections)
     # Separate in each way.
-    found: dict[str, xr.Dataset] = {}
+    separated: dict[str, xr.Dataset] = {}
     left_out = {}
     for way, of_reflections in WAYS.items():
         try:
             movie = uncalibrated.moved(undone, reflections) if of_reflections else undone
-            parts = uncalibrated.uncalibrated_reflection(movie)
+            separation = uncalibrated.uncalibrated_reflection(movie)
         except ValueError as error:
             left_out[way] = str(error)
         else:
-            found[way] = parts.drop_vars("emission") if found else parts
-    if not found:
+            separated[way] = separation.drop_vars("emission") if separated else separation
+    if not separated:
         raise ValueError(f"Inseparable scene: {left_out}. Must be separable in one way.")
     # Choose pixels and frames by the first separation.
-    first = found[next(iter(found))]
+    first = separated[next(iter(separated))]
     pixels = {"object": shared, "moving": shared & (first["correlation"] > uncalibrated.CORRELATED)}
     frames = strongest(first["reflection"], shared, number)
     # Correlate each reflection with each of the authors' maps.
     coords = {"way": list(WAYS), "map": list(KINDS), "pixels": list(pixels)}
     table = xr.DataArray(np.full((len(WAYS), 2, 2), np.nan), coords, attrs={"units": "1"})
-    for way, kind, where in itertools.product(found, KINDS, pixels):
-        reflection = found[way]["reflection"]
+    for way, kind, where in itertools.product(separated, KINDS, pixels):
+        reflection = separated[way]["reflection"]
         score = agreement(reflection, scene.theirs[kind], frames, pixels[where]).median()
         table.loc[{"way": way, "map": kind, "pixels": where}] = score
     scores = agreement(first["reflection"], scene.theirs[KINDS[0]], frames, shared)
@@ -222,9 +228,9 @@ def compare_all(
 ) -> tuple[dict[str, Comparison], dict[str, str]]:
     """Compare all scenes, see `compare`; and why those that cannot be separated are left out."""
     compared, left_out = {}, {}
-    for name, one in scenes.items():
+    for name, scene in scenes.items():
         try:
-            compared[name] = compare(one, number)
+            compared[name] = compare(scene, number)
         except ValueError as error:
             left_out[name] = str(error)
     return compared, left_out
@@ -235,26 +241,31 @@ def report(compared: Mapping[str, Comparison]) -> str:
     columns = [f"{kind}, {where}" for kind in KINDS for where in ("object", "moving")]
     heads = ("scene", "still edges [pixel]", "reflections [pixel]", "their correlation, at 0")
     shifts, rows, notes = [heads], [("scene", "way", *columns)], []
-    for name, found in compared.items():
-        both = [f"{float(part.sel(axis='x')):.2f}" for part in (found.edges, found.reflections)]
-        peak, at_0 = (found.reflections.attrs[key] for key in ("correlation", "correlation_at_0"))
-        shifts.append((name, both[0], both[1], f"{peak:.2f}, {at_0:.2f}"))
+    for name, comparison in compared.items():
+        displacements = [
+            f"{float(displacement.sel(axis='x')):.2f}"
+            for displacement in (comparison.edges, comparison.reflections)
+        ]
+        peak, at_0 = (
+            comparison.reflections.attrs[key] for key in ("correlation", "correlation_at_0")
+        )
+        shifts.append((name, displacements[0], displacements[1], f"{peak:.2f}, {at_0:.2f}"))
         for way in WAYS:
-            scores = found.table.sel(way=way).values.ravel()
+            scores = comparison.table.sel(way=way).values.ravel()
             rows.append((name, way, *(f"{score:.3f}" for score in scores)))
-        undone = found.undone.attrs["scale_undone"] or "no band"
-        shares = ", ".join(f"{share:.2f}" for share in found.undone.attrs["scale_explained"])
+        undone = comparison.undone.attrs["scale_undone"] or "no band"
+        shares = ", ".join(f"{share:.2f}" for share in comparison.undone.attrs["scale_explained"])
         note = f"{name}: scale undone in {undone}; it explains {shares} of the surroundings' change"
-        reasons = "".join(f"; {way} left out: {why}" for way, why in found.left_out.items())
+        reasons = "".join(f"; {way} left out: {why}" for way, why in comparison.left_out.items())
         notes.append(f"- {note}{reasons}")
-    parts = (
+    blocks = (
         "Published videos, not radiometric. The second band shows at p the first's p + d, [pixel].",
         numbers.table(shifts),
         "Correlation of the reflection's map with the authors', median of the frames.",
         numbers.table(rows),
         "\n".join(notes),
     )
-    return "\n\n".join(parts) + "\n"
+    return "\n\n".join(blocks) + "\n"
 
 
 def _file(files: Mapping[str, Path], name: str) -> Path:

@@ -13,10 +13,8 @@ from attack.oracle import Attack, Verdict, wrong
 from attack.scenes import pick
 from dbthermal import calibration, correction, emissivity, limits, separation, simulation
 from dbthermal import response as responses
-from reproduction import metrics
 from reproduction.experiments.bench import contact_measurements
 from reproduction.filters import condition_numbers, rank_filters
-from reproduction.metrics import reflected_change
 
 
 @dataclass(frozen=True)
@@ -55,20 +53,13 @@ def _steps() -> Mapping[str, Step]:
     reflector = bench.drop_vars("background_temperature").assign(reflected_counts=foil)
     fixed = {"response": curves, "reading_std": std}
     result = separation.solve(corrected, curves)
-    used = result[["background_temperature", "emissivity", "status"]]
-    apparent = responses.apparent_temperature(curves, corrected["counts"])
     table = emissivity.embedded_table()
     netd = emissivity.filter_noise(0.03, [str(band) for band in table["band"].values])
     wavelength = np.linspace(6e-6, 16e-6, 60)
     values = ("wavelength", 0.8 + 0.15 * np.sin(wavelength * 1e6), {"units": "1"})
     spectrum = xr.Dataset({"emissivity": values}, {"wavelength": wavelength})
-    kelvin = (truth["object_temperature"] + 0.01 * truth["x"]).assign_attrs(units="K")
-    off, flat = kelvin + 0.1, raw["counts"].mean("time").assign_attrs(units="count")
-    off.name = kelvin.name = "object_temperature"
-    plain = {"first": off.drop_attrs(), "second": kelvin.drop_attrs()}
+    flat = raw["counts"].mean("time").assign_attrs(units="count")
     completed = {"result": result, "corrected": corrected, "response": curves}
-    changed = {"apparent": apparent, "result": used}
-    errors = {"estimate": off.assign_attrs(units="K"), "truth": kelvin}
     steps = [
         Step(correction.blackbody_statistics, {"movies": movies}),
         Step(correction.fit_correction, {"blackbody": frames}),
@@ -79,16 +70,12 @@ def _steps() -> Mapping[str, Step]:
         Step(calibration.fit_emissivity, {"measured": bench, **fixed}),
         Step(calibration.reflector_emissivity, {"measured": reflector, **fixed}),
         Step(responses.apparent_temperature, {"response": curves, "counts": corrected["counts"]}),
-        # Used where the object is constant, and where there is no flag.
-        Step(reflected_change, changed, "result", ("apparent",)),
         Step(separation.materials, completed, "result", ("result", "corrected")),
         Step(limits.bounds, {"scene": truth, "response": curves}),
         Step(limits.plan, {"table": table, "noise": netd}),
         Step(condition_numbers, {"table": table}),
         Step(rank_filters, {"table": table, "noise": netd}),
         Step(_band_table, {"spectrum": spectrum}),
-        Step(metrics.correlation, plain, "first"),
-        Step(metrics.relative_error_celsius, errors, "estimate"),
     ]
     return {step.call.__name__: step for step in steps}
 

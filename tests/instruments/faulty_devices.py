@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from dbthermal.instruments import _apt as apt
-from dbthermal.instruments import _fslp as fslp
+from dbthermal.instruments import boson
 from dbthermal.instruments._apt import Id
 from dbthermal.instruments.boson import Boson
 from dbthermal.instruments.emulated import World
@@ -170,10 +170,10 @@ class FaultyApt(EmulatedApt):
 
 
 def request(
-    sequence: int, command: int, data: bytes = b"", status: int = fslp.REQUEST, channel: int = 0
+    sequence: int, command: int, data: bytes = b"", status: int = boson.REQUEST, channel: int = 0
 ) -> bytes:
     """Bytes of a request to a Boson."""
-    return fslp.encode(fslp.Frame(channel, sequence, command, status, data))
+    return boson.encode(boson.Packet(channel, sequence, command, status, data))
 
 
 reply = partial(request, status=0)
@@ -191,9 +191,9 @@ class FaultyBoson(EmulatedBoson):
     def __init__(self, world: World, name: str) -> None:
         super().__init__(world, name)
         self.answers, self.stalls = math.inf, False
-        self._inbox: deque[fslp.Frame] = deque()
+        self._inbox: deque[boson.Packet] = deque()
 
-    def request(self, frame: fslp.Frame) -> None:
+    def request(self, frame: boson.Packet) -> None:
         """Take in one request, to be answered when the shutter is open."""
         self.answers -= 1
         if self.answers >= 0:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from hostile_files import coloured, video, wave
 from numpy.testing import assert_allclose, assert_array_equal
+from refused import refused
 
 from dbthermal import store
 from reproduction import palettes
@@ -58,17 +59,14 @@ def test_masked_palette_video(masked: Path) -> None:
     assert movie["value"].attrs["radiometric"] == 0
 
 
-@pytest.mark.parametrize(
-    ("palette", "message"),
+test_another_palette_is_refused = refused(
+    palettes.palette_video,
     [
         *((name, f"Palette '{name}' does not fit.*from 'plasma'") for name in ("turbo", "gray")),
         *((name, f"Unknown palette '{name}'") for name in ("plasmatic", "tab10")),
     ],
+    "plasma",
 )
-def test_another_palette_is_refused(plasma: Path, palette: str, message: str) -> None:
-    """A palette that does not fit, with the better one, or that is unknown or of few colours."""
-    with pytest.raises(ValueError, match=message):
-        palettes.palette_video(plasma, palette)
 
 
 def test_masked_videos_are_refused(masked: Path, tmp_path: Path) -> None:

@@ -170,3 +170,5 @@ def test_agreement() -> None:
     np.testing.assert_allclose(again, found, rtol=0, atol=1e-9)
     with pytest.raises(ValueError, match=r"Invalid shape \(10, 30, 60\) .* Must be \(9, 30, 60\)"):
         published.agreement(ours[1:], theirs, np.arange(3), inside)
+    with pytest.raises(ValueError, match="Constant or unknown map"):
+        published.agreement(0 * ours, theirs, frames, inside)

@@ -24,7 +24,7 @@ from typing import Any, Final
 
 from scipy.constants import zero_Celsius
 
-from dbthermal.instruments import _apt, _fslp, boson
+from dbthermal.instruments import _apt, boson
 from dbthermal.instruments._apt import Id
 from dbthermal.instruments.camera import FfcMode, FfcStatus
 from dbthermal.instruments.emulated import ROOM, World
@@ -115,7 +115,7 @@ class EmulatedBoson(Line):
         # At power-on, by the identifier that sets them; not those of a real camera.
         self.settings = {setting.set_command: 0 for setting in boson.SETTINGS}
         self.settings[boson.FFC_MODE.set_command] = int(FfcMode.AUTO)
-        self._name, self._decoder = name, _fslp.Decoder()
+        self._name, self._decoder = name, boson.Decoder()
 
     @property
     def plugged(self) -> bool:  # type: ignore[override]
@@ -125,14 +125,14 @@ class EmulatedBoson(Line):
     def receive(self, data: bytes) -> None:
         """Take in bytes; frames of channels that have no commands are ignored."""
         for frame in self._decoder.feed(data):
-            if frame.channel == _fslp.COMMAND_CHANNEL:
+            if frame.channel == boson.COMMAND_CHANNEL:
                 self.request(frame)
 
-    def request(self, frame: _fslp.Frame) -> None:
+    def request(self, frame: boson.Packet) -> None:
         """Take in one request, and answer at once."""
         self._replies.append(self.reply(frame))
 
-    def reply(self, request: _fslp.Frame) -> bytes:
+    def reply(self, request: boson.Packet) -> bytes:
         """Bytes of the reply to a request, with status and data."""
         command, data, status, answer = request.command, request.data, 0, b""
         with self.world.lock:
@@ -141,7 +141,7 @@ class EmulatedBoson(Line):
             readings = self._readings()
             sizes = {boson.RUN_FFC: 0, **dict.fromkeys(self.settings, 4)}
             sizes |= dict.fromkeys(readings, 0)
-            if request.status != _fslp.REQUEST or len(data) != sizes.get(command):
+            if request.status != boson.REQUEST or len(data) != sizes.get(command):
                 status = _REFUSED
             elif command == boson.RUN_FFC:
                 self.world.start_ffc(self._name)
@@ -149,7 +149,7 @@ class EmulatedBoson(Line):
                 (self.settings[command],) = struct.unpack(">i", data)
             else:
                 answer = readings[command]
-        return _fslp.encode(replace(request, status=status, data=answer))
+        return boson.encode(replace(request, status=status, data=answer))
 
     def _readings(self) -> dict[int, bytes]:
         """Data of every reading and setting, by the identifier that reads it."""

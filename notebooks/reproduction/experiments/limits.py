@@ -79,23 +79,23 @@ def near_bound(
     rig = Rig(bands=tuple(bands), noise=tuple(noise))
     case = {"emissivity": list(emissivity), "start": ends[0], "stop": ends[1], "noise_known": False}
     truth, result = cases.run_case(case, rig, np.arange(int(clock[0])) / clock[1], pixels, seed)
-    known = result["object_temperature"].notnull().all("time")
+    solved = result["object_temperature"].notnull().all("time")
     response = rig.response()
     free = limits.bounds(truth, response, resting=False, emissivity_std=BEFOREHAND)
     slope = limits.bounds(
         truth, _as_line(response, rig), resting=False, response_kind="linear"
     ).assign(object_temperature_std=np.nan * free["object_temperature_std"])
     names, kinds = [f"{it}_std" for it in _BOUNDED], (free, slope, limits.bounds(truth, response))
-    told = gridded([kind[names] for kind in kinds], {"knowing": KNOWING})
+    bound = gridded([kind[names] for kind in kinds], {"knowing": KNOWING})
     second = (1.0 - truth["emissivity"]) / (1.0 - truth["emissivity"].isel(band=0))
     squared = (result["object_temperature"] - truth["object_temperature"]) ** 2
     measured = {
         "reflection_ratio_error": (result["reflection_ratio"] - second).isel(band=1),
-        "reflection_ratio_bound": told["reflection_ratio_std"].isel(band=1),
+        "reflection_ratio_bound": bound["reflection_ratio_std"].isel(band=1),
         "object_temperature_error": squared.mean("time", skipna=False) ** 0.5,
-        "object_temperature_bound": (told["object_temperature_std"] ** 2).mean("time") ** 0.5,
+        "object_temperature_bound": (bound["object_temperature_std"] ** 2).mean("time") ** 0.5,
     }
-    flat = {name: _row(part.where(known), name) for name, part in measured.items()}
+    flat = {name: _row(values.where(solved), name) for name, values in measured.items()}
     return xr.Dataset(flat | {"status": _row(result["status"], "status")}).assign_attrs(
         origin="simulated", seed=seed
     )
@@ -109,7 +109,7 @@ def summary(measured: xr.Dataset) -> xr.Dataset:
     `scatter` (knowing) [1], standard deviation over the pixels of the ratio's error over its bound;
     `excess` (knowing) [1], the object's error over its bound.
     """
-    parts = {
+    figures = {
         name: _rms(measured[name])
         for name in (f"{quantity}_{which}" for quantity in _BOUNDED for which in ("error", "bound"))
     }
@@ -117,10 +117,10 @@ def summary(measured: xr.Dataset) -> xr.Dataset:
         "scatter": (measured["reflection_ratio_error"] / measured["reflection_ratio_bound"]).std(
             "pixel"
         ),
-        "excess": parts["object_temperature_error"] / parts["object_temperature_bound"],
+        "excess": figures["object_temperature_error"] / figures["object_temperature_bound"],
     }
-    shares = {name: part.assign_attrs(units="1") for name, part in shares.items()}
-    return xr.Dataset(parts | shares, attrs=measured.attrs)
+    shares = {name: values.assign_attrs(units="1") for name, values in shares.items()}
+    return xr.Dataset(figures | shares, attrs=measured.attrs)
 
 
 def pooled(
@@ -152,13 +152,13 @@ def pooled(
     linear = _as_line(response, rig)
     bound = limits.bounds(truth, linear, resting=False, response_kind="linear")
     single = _rms(_row(bound["reflection_ratio_std"].isel(band=1), "reflection_ratio"))
-    ratio, parts = cases.reflection_ratio(list(emissivity)).item(), []
+    ratio, errors = cases.reflection_ratio(list(emissivity)).item(), []
     for size in sizes:
         labels = xr.DataArray(np.arange(pixels)[np.newaxis] // size, dims=("y", "x"))
         result = separation.solve(capture, response, pool=None if size == 1 else labels)
-        parts.append(_of_groups(size, truth, result, ratio))
-        parts[-1]["reflection_ratio_bound"] = (single / np.sqrt(size)).assign_attrs(units="1")
-    groups = gridded(parts, {"size": sizes})
+        errors.append(_of_groups(size, truth, result, ratio))
+        errors[-1]["reflection_ratio_bound"] = (single / np.sqrt(size)).assign_attrs(units="1")
+    groups = gridded(errors, {"size": sizes})
     return groups.drop_vars("band", errors="ignore").assign_attrs(origin="simulated")
 
 
@@ -170,8 +170,8 @@ def _of_groups(size: int, truth: xr.Dataset, result: xr.Dataset, ratio: float) -
     }
     # The median, for a pixel that the separation excludes from its group keeps a separate ratio.
     measured = {
-        name: _rms(_row(part.isel(band=1).coarsen(x=size).median(), "reflection_ratio"))
-        for name, part in of_groups.items()
+        name: _rms(_row(values.isel(band=1).coarsen(x=size).median(), "reflection_ratio"))
+        for name, values in of_groups.items()
     }
     error = result["object_temperature"] - truth["object_temperature"]
     measured["object_temperature_error"] = _rms(error.stack(pixel=error.dims)).assign_attrs(
@@ -215,22 +215,17 @@ def border_kept(labels: xr.DataArray, truth: xr.DataArray) -> xr.Dataset:
 
     `right` [1], share of the pixels farther than `BORDER` from a border that carry the label most
     frequent in their panel; `bleeding` [1], number of labels that are on both sides of a border,
-    that far from it. Raises a ValueError if the images differ in size, or there is one panel only.
+    that far from it.
     """
     estimate, panels = labels.values, np.unique(truth.values)
-    if estimate.shape != truth.shape or panels.size < 2:
-        raise ValueError(
-            f"Invalid images of {estimate.shape} and {truth.shape} pixels, {panels.size} panels. "
-            "Must be alike, of two panels or more."
-        )
     distance = np.zeros(estimate.shape)
     for panel in panels:
         distance += distance_transform_edt(truth.values == panel)
     inner = [estimate[(truth.values == panel) & (distance > BORDER)] for panel in panels]
-    right = sum(int(np.bincount(part[part >= 0], minlength=1).max()) for part in inner)
-    sides = [set(np.unique(part[part >= 0])) for part in inner]
+    right = sum(int(np.bincount(labelled[labelled >= 0], minlength=1).max()) for labelled in inner)
+    sides = [set(np.unique(labelled[labelled >= 0])) for labelled in inner]
     bleeding = sum(sum(label in side for side in sides) > 1 for label in set().union(*sides))
-    return cases.scalars(right=right / sum(part.size for part in inner), bleeding=bleeding)
+    return cases.scalars(right=right / sum(labelled.size for labelled in inner), bleeding=bleeding)
 
 
 def _as_line(response: xr.Dataset, rig: Rig) -> xr.Dataset:
@@ -246,9 +241,9 @@ def _row(image: xr.DataArray, name: str) -> xr.DataArray:
     return row.assign_attrs(units=_UNITS.get(name.rsplit("_", 1)[0], "1"))
 
 
-def _rms(part: xr.DataArray) -> xr.DataArray:
+def _rms(values: xr.DataArray) -> xr.DataArray:
     """Root mean square over the pixels that have a value."""
-    return ((part**2).mean("pixel") ** 0.5).assign_attrs(part.attrs)
+    return ((values**2).mean("pixel") ** 0.5).assign_attrs(values.attrs)
 
 
 def judge(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
@@ -321,10 +316,10 @@ def _coverage(truth: xr.Dataset, result: xr.Dataset) -> dict[str, xr.DataArray]:
 def _width(truth: xr.Dataset, result: xr.Dataset) -> xr.DataArray:
     """Median stated deviation of the emissivities over the robust one of their errors."""
     error = result["emissivity"] - truth["emissivity"]
-    known = error.notnull().all("band")
+    solved = error.notnull().all("band")
     shape = (error.sizes["band"], -1)
-    errors = error.where(known).values.reshape(shape)[:, known.values.ravel()]
-    stds = result["emissivity_std"].values.reshape(shape)[:, known.values.ravel()]
+    errors = error.where(solved).values.reshape(shape)[:, solved.values.ravel()]
+    stds = result["emissivity_std"].values.reshape(shape)[:, solved.values.ravel()]
     width = np.full(shape[0], np.nan)
     if errors.size:
         lower, upper = np.quantile(errors, _INNER, axis=1)

@@ -65,11 +65,8 @@ def apart(delay: float, *, pixels: Mapping[str, Any], seed: int) -> xr.Dataset:
 
     The delay of the second band is rounded to 1 / `cases.STEPS`; `pixels` are fields of `Pixels`.
     `found` [frame] is the offset by `alignment.time_offset`; over `treatment` the variables of
-    `cost`, where "without" is a capture of both bands at the later time. Raises a ValueError if the
-    delay is negative.
+    `cost`, where "without" is a capture of both bands at the later time.
     """
-    if delay < 0:
-        raise ValueError(f"Invalid delay {delay} frames. Must be zero or positive.")
     kind, later = Pixels(**pixels), round(delay * STEPS)
     rng, response = np.random.default_rng(seed), Rig().response()
     scene = kind.scene(rng, later=later, steps=STEPS)
@@ -136,7 +133,7 @@ def parallax(
         )
     # People walking by: a margin around the view, and several columns a pixel.
     value = xr.DataArray(list(GLASS), dims="band", coords={"band": list(Rig().bands)})
-    time, known = np.arange(int(clock[0])) / clock[1], Rig().response()
+    time, response = np.arange(int(clock[0])) / clock[1], Rig().response()
     height, width = (size + 2 * _MARGIN for size in shape)
     rng = np.random.default_rng(seed)
     wide = simulation.walkers(time, (height, width * COLUMNS), value, rng)
@@ -145,14 +142,14 @@ def parallax(
         mirrored = _view(wide, (right + more, down))["background_temperature"]
         second = _view(wide, (right, down)).assign(background_temperature=mirrored)
         rng = np.random.default_rng(seed + 1)
-        captures.append(disturbances.by_cameras((first, second), known, rng))
+        captures.append(disturbances.by_cameras((first, second), response, rng))
     capture, single = captures
     estimate = alignment.register(capture, model="translation")
     true = estimate.copy(data=np.stack([np.eye(3), np.eye(3)]))
     true[1, :2, 2] = -np.array(shift)
     align = partial(alignment.align, capture, offset=0.0)
     captures = [align(transform=estimate), align(transform=true), single]
-    result = _compare(first, captures, known, VIEWS)
+    result = _compare(first, captures, response, VIEWS)
     away = float(np.hypot(*(estimate - true).values[1, :2, 2]))
     return result.assign(misregistered=((), away, {"units": "pixel"}))
 

@@ -34,25 +34,13 @@ class Camera:
     """A pinhole camera with square pixels.
 
     At a position, with a target at the middle of its view [m], of a shape (rows, columns) and a
-    horizontal field of view [degrees]; 24 in the paper.
+    horizontal field of view [degrees], 24 in the paper; its target is not straight above or below.
     """
 
     position: Point
     target: Point
     shape: tuple[int, int]
     field_of_view: float = 24.0
-
-    def __post_init__(self) -> None:
-        """Check field of view, shape and direction."""
-        if not 0 < self.field_of_view < 180:
-            rule = "Must lie in (0, 180)"
-            raise ValueError(f"Invalid field_of_view {self.field_of_view} degrees. {rule}.")
-        if min(self.shape) < 1:
-            raise ValueError(f"Invalid shape {self.shape} of the camera. Must be positive.")
-        right = np.cross(np.subtract(self.target, self.position), _UP)
-        if not np.linalg.norm(right) > 0:
-            message = f"Invalid target {self.target} of the camera at {self.position}"
-            raise ValueError(f"{message}. Must not be straight above or below.")
 
     @cached_property
     def axes(self) -> Array:
@@ -125,27 +113,27 @@ def _on_faces(
 ) -> tuple[Array, Array]:
     """Distance (ray,) and weights (ray, 3) in the faces' planes, as by Moller, Trumbore (1997)."""
     distance, weights = np.full(face.size, np.inf), np.zeros((face.size, 3))
-    right, left, way, normal, across = np.empty((5, 3))
+    right, lower, way, normal, across = np.empty((5, 3))
     for ray in range(face.size):
         if face[ray] == MISSED:
             continue
         first, second, third = corners[face[ray]]
         towards = directions[ray]
         for k in range(3):
-            right[k], left[k] = second[k] - first[k], third[k] - first[k]
+            right[k], lower[k] = second[k] - first[k], third[k] - first[k]
             way[k] = origins[ray, k] - first[k]
         for k in range(3):
             i, j = (k + 1) % 3, (k + 2) % 3
-            normal[k] = towards[i] * left[j] - towards[j] * left[i]
+            normal[k] = towards[i] * lower[j] - towards[j] * lower[i]
             across[k] = way[i] * right[j] - way[j] * right[i]
         scale = right[0] * normal[0] + right[1] * normal[1] + right[2] * normal[2]
         u = (way[0] * normal[0] + way[1] * normal[1] + way[2] * normal[2]) / scale
         v = (towards[0] * across[0] + towards[1] * across[1] + towards[2] * across[2]) / scale
         # A ray along the edge of a face may leave it by rounding: back onto it.
-        inside = np.maximum(1.0 - u - v, 0.0), np.maximum(u, 0.0), np.maximum(v, 0.0)
-        total, along = inside[0] + inside[1] + inside[2], 0.0
+        shares = np.maximum(1.0 - u - v, 0.0), np.maximum(u, 0.0), np.maximum(v, 0.0)
+        total, along = shares[0] + shares[1] + shares[2], 0.0
         for k in range(3):
-            weights[ray, k] = inside[k] / total
+            weights[ray, k] = shares[k] / total
         for k in range(3):
             place = weights[ray, 0] * first[k] + weights[ray, 1] * second[k]
             along += (place + weights[ray, 2] * third[k] - origins[ray, k]) * towards[k]
@@ -179,8 +167,8 @@ class Caster:
 
     def interpolate(self, hits: Hits, values: Array) -> Array:
         """Values (..., ray) linear within a face, of values (..., vertex); all rays must meet."""
-        parts = (values[..., self.faces[hits.face, corner]] for corner in range(3))
-        return np.asarray(sum(part * hits.weights[:, corner] for corner, part in enumerate(parts)))
+        terms = (values[..., self.faces[hits.face, corner]] for corner in range(3))
+        return np.asarray(sum(term * hits.weights[:, corner] for corner, term in enumerate(terms)))
 
     def mirrored(self, hits: Hits, directions: Array) -> tuple[Array, Array]:
         """Origins [m] and directions (ray, 3) of rays that the mesh reflects, on either side.

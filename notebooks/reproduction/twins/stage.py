@@ -51,17 +51,6 @@ class Capture:
     blur: float = 0.6  # standard deviation [pixel]
     rays: int = 3  # for each pixel along either side
 
-    def __post_init__(self) -> None:
-        """Check bands, baseline and rays."""
-        if self.emissivity.dims != ("band",):
-            raise ValueError(f"Invalid dims {self.emissivity.dims} of emissivity. Must be (band,).")
-        if self.baseline and self.emissivity.sizes["band"] != 2:
-            names = [str(name) for name in self.emissivity["band"].values]
-            raise ValueError(f"Invalid bands {names} for a baseline. Must be two.")
-        if not (self.blur > 0 and self.rays >= 1):
-            rule = "Must be positive"
-            raise ValueError(f"Invalid blur {self.blur} or rays {self.rays} of a pixel. {rule}.")
-
 
 @dataclass(frozen=True)
 class Stage:
@@ -105,15 +94,15 @@ def take(stage: Stage, capture: Capture) -> xr.Dataset:
     scene["object_share"] = (("y", "x"), share, {"units": "1"})
     scene["on_object"] = (("y", "x"), share > _WHOLE, {"units": "1"})
     if capture.baseline:
-        other = stage.camera.beside(capture.baseline)
+        second = stage.camera.beside(capture.baseline)
         dims = scene["object_temperature"].dims
-        warm, cold, _ = _rendered(stage, capture, caster, other)
-        for name, part in (("object", warm), ("background", cold)):
-            scene[f"second_{name}_temperature"] = (dims, part.astype(np.float32), {"units": "K"})
-        for name, part in zip(
-            ("place_in_second", "shift"), _seen_by_both(stage, caster, other), strict=True
+        warm, cold, _ = _rendered(stage, capture, caster, second)
+        for name, film in (("object", warm), ("background", cold)):
+            scene[f"second_{name}_temperature"] = (dims, film.astype(np.float32), {"units": "K"})
+        for name, film in zip(
+            ("place_in_second", "shift"), _seen_by_both(stage, caster, second), strict=True
         ):
-            scene[name] = (("axis", "y", "x"), part, {"units": "pixel"})
+            scene[name] = (("axis", "y", "x"), film, {"units": "pixel"})
         scene = scene.assign_coords(axis=["y", "x"])
     # Pixels of the thermocouples.
     points = np.reshape(stage.thermocouples, (-1, 3)).astype(np.float64)
@@ -152,22 +141,22 @@ def _rendered(
     hits = caster.cast(origins, directions)
     on, seen = hits.met, hits.select(hits.met)
     origins[on], directions[on] = caster.mirrored(seen, directions[on])
-    again = caster.cast(origins[on], directions[on])
-    itself, bounced = np.flatnonzero(on)[again.met], again.select(again.met)
+    reflections = caster.cast(origins[on], directions[on])
+    itself, bounced = np.flatnonzero(on)[reflections.met], reflections.select(reflections.met)
 
     def pixels(values: Array) -> Array:
         grid = values.reshape(-1, rows * rays, columns * rays)
-        parts = (down[:, n::rays] @ (grid[:, n::rays] @ right[n].T) for n in range(rays))
-        return np.asarray(sum(parts))
+        terms = (down[:, n::rays] @ (grid[:, n::rays] @ right[n].T) for n in range(rays))
+        return np.asarray(sum(terms))
 
     warm, cold = np.empty((2, capture.time.size, *camera.shape))
     for start in range(0, capture.time.size, _FRAMES):
-        part = slice(start, start + _FRAMES)
-        values = incident(origins, directions, capture.time[part], AMBIENT, stage.actors)
-        values[:, itself] = caster.interpolate(bounced, stage.temperature[part])
-        cold[part] = pixels(values)
-        values[:, on] = caster.interpolate(seen, stage.temperature[part])
-        warm[part] = pixels(values)
+        frames = slice(start, start + _FRAMES)
+        values = incident(origins, directions, capture.time[frames], AMBIENT, stage.actors)
+        values[:, itself] = caster.interpolate(bounced, stage.temperature[frames])
+        cold[frames] = pixels(values)
+        values[:, on] = caster.interpolate(seen, stage.temperature[frames])
+        warm[frames] = pixels(values)
     return warm, cold, pixels(on.astype(np.float64))[0]
 
 
@@ -184,17 +173,17 @@ def _optics(size: int, capture: Capture, offset: float = 0.0) -> Array:
     return np.asarray(weights / weights.sum(axis=1, keepdims=True))
 
 
-def _seen_by_both(stage: Stage, caster: Caster, other: Camera) -> tuple[Array, Array]:
+def _seen_by_both(stage: Stage, caster: Caster, second: Camera) -> tuple[Array, Array]:
     """Where the second camera sees a surface point, and where the first sees its reflection."""
     camera, shape = stage.camera, (2, *stage.camera.shape)
     hits = caster.cast(np.asarray(camera.position), camera.directions())
     points = caster.points(hits.select(hits.met))
-    seen = caster.visible(points, other.position)
+    seen = caster.visible(points, second.position)
     met, points = np.flatnonzero(hits.met)[seen], points[seen]
     places, shift = np.full((2, 2, hits.met.size), np.nan)
-    places[:, met] = other.project(points).T
-    towards = unit(points - np.asarray(other.position))
-    way = caster.cast(np.asarray(other.position), towards)
+    places[:, met] = second.project(points).T
+    towards = unit(points - np.asarray(second.position))
+    way = caster.cast(np.asarray(second.position), towards)
     origins, directions = caster.mirrored(way, towards)
     pixels = np.stack(np.unravel_index(met, camera.shape), axis=-1).astype(np.float64)
     place = _reflecting(caster, camera, pixels, origins + stage.mirrored * directions)
@@ -222,9 +211,9 @@ def _reflecting(caster: Caster, camera: Camera, start: Array, bodies: Array) -> 
         # Damped, for along an edge that is straight the reflection hardly changes.
         normal = np.einsum("pai,paj->pij", slope, slope)
         normal += _DAMPING * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(2)
-        known, step = np.isfinite(normal).all(axis=(1, 2)), np.full_like(place, np.nan)
-        towards = -np.einsum("pai,pa->pi", slope, gap)[known, :, np.newaxis]
-        step[known] = np.linalg.solve(normal[known], towards)[..., 0]
+        solvable, step = np.isfinite(normal).all(axis=(1, 2)), np.full_like(place, np.nan)
+        towards = -np.einsum("pai,pa->pi", slope, gap)[solvable, :, np.newaxis]
+        step[solvable] = np.linalg.solve(normal[solvable], towards)[..., 0]
         length = np.linalg.norm(step, axis=1, keepdims=True)
         place = place + step / np.maximum(1.0, length / _LARGEST)
     return np.where(length < _CONVERGED, place, np.nan)
@@ -285,7 +274,7 @@ WALKS: Final = (
 def passers_by(time: Array, rng: np.random.Generator) -> list[Actor]:
     """Two people who walk back and forth near the object, on the floor below the table."""
     routes = [pacing(corners, time, rng) for corners in WALKS]
-    return [part for route in routes for part in person(route, height=-TABLE)]
+    return [actor for route in routes for actor in person(route, height=-TABLE)]
 
 
 def since(

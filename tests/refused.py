@@ -1,0 +1,28 @@
+"""Tests of what is refused, from a table of arguments and the messages of their errors."""
+
+import re
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import pytest
+
+REFUSALS = (KeyError, TypeError, ValueError)
+
+
+def refused(call: Callable[..., Any], rows: Iterable[Sequence[Any]], fixtures: str = "") -> Any:
+    """Test of a function that raises an error for the arguments of each row.
+
+    The last entry of a row is a part of the error's message, or a pattern of it. The function takes
+    the values of the fixtures, by name, and then the arguments.
+    """
+
+    @pytest.mark.parametrize("row", [*rows], ids=lambda row: str(row[-1]))
+    def test(row: Sequence[Any], request: pytest.FixtureRequest) -> None:
+        *arguments, message = row
+        values = [request.getfixturevalue(name) for name in fixtures.split()]
+        with pytest.raises(REFUSALS) as caught:
+            call(*values, *arguments)
+        text = str(caught.value)
+        assert message in text or re.search(message, text), text
+
+    return test
