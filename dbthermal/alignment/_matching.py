@@ -249,7 +249,7 @@ def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Arra
 
     The deviation is the jackknife's over parts of the image: where several depths are mirrored, the
     windows contradict one another by far more than noise. Third, the energy (2, y, x) of the others
-    that the moved movie explains, and all of it, in variances of noise.
+    that the moved movie explains, and all of it beside noise, in variances of noise.
     """
     places, used = movies.pairs(shift)
     sums = images.products(movies.first, movies.others, places, rate) * used[..., np.newaxis]
@@ -267,6 +267,7 @@ def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Arra
         late = equations[..., 3, 2] - np.sum(share * equations[..., 3, :2], axis=-1)
         seen = equations[..., 2, 2] - np.sum(share * cross, axis=-1)
         moved, common, second = (windows[..., place] for place in (0, 4, 14))
+        second = second - movies.freedom * (level * _VALUE_NOISE) ** 2
         alike = np.maximum(common, 0.0) ** 2 / np.maximum(moved, np.finfo(np.float64).tiny)
         totals += np.where(used, np.stack([late, seen, alike, second]), 0.0) / level**2
     gradient, information, *energy = totals

@@ -170,11 +170,6 @@ class Capture:
         return list(np.concatenate(blocks, axis=1)), valid
 
 
-def freedom(functions: Movie) -> float:
-    """Degrees of freedom of white noise along functions of time (time, plane)."""
-    return float(np.sum(functions**2))
-
-
 def white(frames: int, period: float) -> float:
     """Degrees of freedom of white noise that a smoother leaves, see `Capture.smoothing`."""
     frequency = np.pi * (np.arange(frames) + 0.5) / frames

@@ -34,6 +34,8 @@ _WIDE: Final = 6.0  # deviation of the window in which a field and its data are 
 _RIDGE: Final = 1e-6  # of the largest information, where there is none
 # Shift from which the cameras see reflections apart: in standard deviations, and in pixels.
 _SIGMAS, _LEAST_SHIFT = 3.0, 0.1
+# Share of what none leaves that a shift explains: from 0.36; of clouds and heat alone below 0.03.
+_EXPLAINED: Final = 0.1
 _NEAR: Final = 0.125  # of the image's smaller side, by which a field is extrapolated
 
 
@@ -88,8 +90,7 @@ def _matched(corrected: xr.Dataset, capture: Capture) -> xr.Dataset:
     spline = Spline((shape[0], shape[1]), max(shape) / 3.0)
     factor = 2 ** max(0, int(np.log2(min(shape) / _COARSE)))
     capture, tried, period, field = _coarse(capture, spline, factor)
-    # Planes in one look at the films. The delay is seen in slower changes, too, in which there is
-    # more than noise.
+    # Planes in one look at the films. In slower changes there is more of a delay than noise.
     slow = min((longer for longer in tried if longer >= max(period, _SLOW)), default=max(tried))
     functions = [tried[length] for length in sorted({period, slow})]
     movies, white = capture.planes(functions), planes.white(capture.frames.size, period)
@@ -97,7 +98,7 @@ def _matched(corrected: xr.Dataset, capture: Capture) -> xr.Dataset:
     def level(place: int, factor: int) -> Movies:
         """Movies of the changes within one of the periods, of coarser pixels."""
         pictures = [binned(movie, factor) for movie in movies[place]]
-        freedom = planes.freedom(functions[place])
+        freedom = float(np.sum(functions[place] ** 2))  # of white noise
         return Movies.blurred(pictures, capture.valid, capture.noise, freedom, factor, white)
 
     # From coarser pixels to those of the capture.
@@ -112,7 +113,13 @@ def _matched(corrected: xr.Dataset, capture: Capture) -> xr.Dataset:
     change = np.asarray(np.gradient(np.eye(times.size), times, axis=0)).T @ functions[-1]
     rate = np.linalg.lstsq(functions[-1], change)[0].astype(np.float32)
     slower = fine if len(movies) == 1 else level(-1, 1)
-    late, std, energy = matching.delay(slower, rate, field.on(fine.centres()))
+    place = field.on(fine.centres())
+    late, std, energy = matching.delay(slower, rate, place)
+    # Of something else is a shift that explains little of what none leaves.
+    still = matching.delay(slower, rate, np.zeros_like(place))[2]
+    moved, rest = np.sum([energy, still], axis=(2, 3), where=energy[1] * still[1] != 0.0)
+    if moved[0] - rest[0] <= _EXPLAINED * max(rest[1] - rest[0], 0.0):
+        spread = np.maximum(spread, place**2)
     result = _result(corrected, capture, field, data, spread)
     result["energy"] = ("part", "y", "x"), energy
     return result.assign_attrs(delay=late, delay_std=std)
@@ -120,12 +127,8 @@ def _matched(corrected: xr.Dataset, capture: Capture) -> xr.Dataset:
 
 def seen_apart(field: xr.Dataset) -> bool:
     """Say that the cameras stand apart: along an axis their shift is more than its deviation."""
-    resolved = field["known"].values
-    if not resolved.any():
-        return False
-    sizes = (np.abs(field[name].values[:, resolved]) for name in ("shift", "shift_std"))
-    shift, std = (np.median(array, axis=1) for array in sizes)
-    return bool(np.any(shift > np.maximum(_SIGMAS * std, _LEAST_SHIFT)))
+    sizes = abs(field[["shift", "shift_std"]]).where(field["known"]).median(("y", "x"))
+    return bool(np.any(sizes["shift"] > np.maximum(_SIGMAS * sizes["shift_std"], _LEAST_SHIFT)))
 
 
 def _coarse(
@@ -142,7 +145,7 @@ def _coarse(
             break
         tried[period] = capture.functions(signals[0], period)
         functions = tried[period][:, :_FEW]
-        white, freedom = planes.white(frames, period), planes.freedom(functions)
+        white, freedom = planes.white(frames, period), float(np.sum(functions**2))
         pictures = [signal @ functions for signal in signals]
         level = Movies.blurred(pictures, valid, capture.noise, freedom, factor, white)
         begin = None if result is None else result[-1]

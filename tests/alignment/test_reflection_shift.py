@@ -1,5 +1,6 @@
 """Shift of the reflections between two cameras side by side, against simulated truth."""
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from refused import refused
 from worlds import RESPONSE as WORLD
 from worlds import World, seen
 
-from dbthermal import alignment, schema, simulation, store
+from dbthermal import alignment, schema, separation, simulation, store
 from reproduction import disturbances, twins
 from reproduction.experiments.pictures import Picture, smooth_shift
 from reproduction.experiments.twins import capture_of
@@ -240,3 +241,26 @@ def test_refuses_a_shift_beyond_a_third_of_the_image() -> None:
     capture, _ = drawn(46, (22.0, 0.0), Picture(shape=(40, 48)), frames=150)
     with pytest.raises(ValueError, match="less than a third of the image"):
         alignment.reflection_shift(capture, RESPONSE)
+
+
+@pytest.mark.parametrize("colour", [0.0, 1.0])
+def test_coloured_clouds_are_not_displaced(colour: float) -> None:
+    """What clouds show in one band alone, or an object that heats, is no shift between cameras."""
+    rng, time, knots = np.random.default_rng(1), np.arange(350) / 10.0, np.arange(0.0, 45.0, 0.5)
+    first, alone = np.cumsum(rng.normal(0.0, 1.0, (2, knots.size)), axis=1)
+    skies = first - first.mean(), 1.48 * (first - first.mean()) + colour * (alone - alone.mean())
+    shape = (time.size, 48, 64)
+    moments = np.broadcast_to(time[:, np.newaxis, np.newaxis] + np.linspace(8.0, 0.0, 64), shape)
+    rise = np.linspace(10.0, 20.0, 48)[:, np.newaxis] * (1.0 - np.exp(-time / 12.0))[:, None, None]
+    warm = np.broadcast_to(290.0 + rise, shape)
+    scene = simulation.scene(time, warm, warm, GLASS)
+    clouds = [np.interp(moments, knots, 286.0 + sky) for sky in skies]
+    dims = ("band", *scene["object_temperature"].dims)
+    scene["background_temperature"] = dims, np.array(clouds), {"units": "K"}
+    capture = simulation.observe(scene, RESPONSE, rng)
+    field = alignment.reflection_shift(capture, RESPONSE)
+    assert np.median(np.abs(errors(field, np.zeros((2, 48, 64)))[1]), axis=1).max() < 3.0
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        result = separation.separate(capture, RESPONSE)
+    assert result.attrs["reflection_shift"] == "none"
