@@ -28,9 +28,7 @@ FILMS: Final = {
     "background_temperature": "reflected temperature",
 }
 _LEAST_PAIRS: Final = 12  # pairs of neighbours that give the share of independent errors
-_LARGEST_SHARE: Final = (
-    2.0  # of independent errors in the variance, beyond which it is the material
-)
+_LARGEST_SHARE: Final = 2.0  # of independent errors in the variance; beyond, of the material
 _LEAST: Final = {"rectangle": (2, 2), "ellipse": (2, 2), "polygon": (3, 1000)}
 _ONE_BAND: Final = schema.Variable(("time", "y", "x"), "uint16", "count", "raw signal")
 

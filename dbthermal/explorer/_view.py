@@ -13,20 +13,8 @@ import xarray as xr
 from dbthermal import response as responses
 from dbthermal import schema
 from dbthermal._arrays import Array, Mask, stride
-from dbthermal.explorer._films import (
-    FILMS,
-    Pane,
-    Progress,
-    Region,
-    Values,
-    common_gain,
-    input_panes,
-    marks,
-    mean_std,
-    opened,
-    result_panes,
-    statistics,
-)
+from dbthermal.explorer import _films
+from dbthermal.explorer._films import FILMS, Pane, Progress, Region, Values, input_panes
 from dbthermal.schema import Status
 
 Pixels = Literal["unflagged", "measured", "all"]
@@ -64,9 +52,8 @@ class View:
     Raises
     ------
     TypeError, ValueError
-        If the data are neither a Dataset nor a path; if there is no temperature and no counts, a
-        variable is not as `schema` says, the capture has other frames, pixels or bands, or an event
-        is not at a finite time.
+        If the data are no Dataset or path, or have neither temperature nor counts; a variable is
+        not as `schema` says; the capture has other frames, pixels or bands; or a time is infinite.
 
     Examples
     --------
@@ -88,10 +75,10 @@ class View:
         events: Mapping[str, float] = MappingProxyType({}),
     ) -> None:
         self.progress: Progress | None = None
-        self.data = opened(data, "data")
+        self.data = _films.opened(data, "data")
         is_capture = "object_temperature" not in self.data and "counts" in self.data
-        self.capture = None if capture is None else opened(capture, "capture")
-        self.response = None if response is None else opened(response, "response")
+        self.capture = None if capture is None else _films.opened(capture, "capture")
+        self.response = None if response is None else _films.opened(response, "response")
         sources = {"result": data, "capture": capture, "response": response}
         if is_capture and capture is not None:
             raise ValueError("Invalid second capture. The data are a capture: must be a result.")
@@ -104,14 +91,14 @@ class View:
         }
         reference = self.data if is_capture else self.data.get("object_temperature")
         inputs = [] if self.capture is None else input_panes(self.capture, self.response, reference)
-        results = [] if is_capture else result_panes(self.data)
+        results = [] if is_capture else _films.result_panes(self.data)
         self.panes = {pane.name: pane for pane in (*inputs, *results)}
         film = next(iter(self.panes.values())).array
         self.time = film["time"].values.astype(np.float64)
         self.shape: tuple[int, int] = film.shape[1], film.shape[2]
         shown = self.data if self.capture is None else self.capture
         stated = {name: float(moment) for name, moment in events.items()}
-        self.events = marks(shown, self.time) | stated
+        self.events = _films.marks(shown, self.time) | stated
         for name, moment in self.events.items():
             if not np.isfinite(moment):
                 raise ValueError(f"Invalid time {moment} s of the event {name!r}. Must be finite.")
@@ -222,7 +209,7 @@ class View:
             if pixels == "measured" and "bridged" in self.data and base in FILMS:
                 bridged = self.data["bridged"].isel(time=frames, y=box[0], x=box[1]).values
                 values = np.where(bridged[:, where], np.float32(np.nan), values)
-            result = statistics(values)
+            result = _films.statistics(values)
             std = common = np.full(values.shape, np.nan)
             if pane.name.startswith("input "):
                 std, common = self._noise(pane, values), np.zeros(values.shape)
@@ -234,7 +221,7 @@ class View:
             finite, shared = np.isfinite(values), self._shared(pane, values, box, where)
             if pane.std:
                 std = np.sqrt(np.maximum(std**2 - shared**2, 0.0))
-            std = mean_std(np.where(finite, std, np.nan), common)
+            std = _films.mean_std(np.where(finite, std, np.nan), common)
             shared_std = np.sum(shared, axis=-1, where=finite) / np.maximum(result["pixels"], 1)
             shared_std = np.where(result["pixels"] > 0, shared_std, np.nan)
             return {**result, "std": np.hypot(std, shared_std), "calibration_std": shared_std}
@@ -268,7 +255,7 @@ class View:
             variance = cut["emissivity_std"].values ** 2
             covariance = np.eye(len(variance))[..., None, None] * variance
         measured = where & ((self.status[box] & COMPLETED) == 0)
-        gains = common_gain(np.where(measured, cut["emissivity"].values, np.nan), covariance)
+        gains = _films.common_gain(np.where(measured, cut["emissivity"].values, np.nan), covariance)
         return np.asarray(gains[list(FILMS).index(pane.name)][where])
 
     def _shared(self, pane: Pane, values: Values, box: tuple[slice, ...], where: Mask) -> Array:
