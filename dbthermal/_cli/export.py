@@ -84,7 +84,8 @@ def _regions(result: xr.Dataset, boxes: Iterable[Sequence[int]]) -> dict[str, ex
     for top, bottom, left, right in boxes:
         label = f"rows {top} to {bottom}, columns {left} to {right}"
         if not (0 <= top < bottom <= height and 0 <= left < right <= width):
-            raise ValueError(f"Invalid {label}. Must lie in the image of {height} x {width}.")
+            rule = f"Must lie in the image of {height} x {width}, and end after it begins"
+            raise ValueError(f"Invalid {label}. {rule}.")
         regions[label] = explorer.Region("rectangle", ((top, left), (bottom, right)))
     return regions
 
