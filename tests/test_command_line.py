@@ -421,6 +421,14 @@ def test_curves_films_pictures(results: Path) -> None:
     assert (results / "out.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_curves_of_pixels_copy_no_film(results: Path) -> None:
+    """A curve of few pixels is written where no file may be as large as a film of the result."""
+    limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (10**5,) * 2); "
+    places = ["--pixel", "3", "4", "--region", "2", "6", "10", "30", "-o", "few.csv"]
+    found = run(results, "export", "result.zarr", *places, before=limit)
+    assert found.returncode == 0, found.stderr
+
+
 def test_report_and_explorer(results: Path) -> None:
     """A report is a page with the region's name; the explorer's notebook has one valid cell."""
     shown = ["result.zarr", "aligned.zarr", "response.zarr"]

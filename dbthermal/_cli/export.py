@@ -119,7 +119,6 @@ def _picture(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dic
     if options.variable == "status":
         store.save_figure(figures.status(result), path, provenance(options))
         return {"shape": list(result["status"].shape)}
-    # The last image, in degrees Celsius.
     array = result[options.variable]
     image = array.isel({dim: -1 for dim in array.dims if dim not in ("y", "x")})
     unit, label = array.attrs.get("units", "1"), str(array.name).replace("_", " ")

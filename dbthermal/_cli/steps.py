@@ -151,7 +151,6 @@ def _blackbody(options: argparse.Namespace) -> xr.Dataset:
         from dbthermal.instruments import recording  # noqa: PLC0415 - optional
 
         return recording.open_sweep(*options.sweep, frames=frames.stop)
-    # Files of each temperature.
     movies = []
     for temperature, *paths in options.at:
         if isinstance(temperature, Path):
@@ -300,7 +299,6 @@ def plan(options: argparse.Namespace) -> dict[str, Any]:
         for name in (name for name in options.materials if name not in names):
             raise ValueError(f"Unknown material '{name}'. Must be one of {names}.")
         table = table.sel(material=[*dict.fromkeys(options.materials)])
-    # Plan of the capture, and its best filter by material.
     level = {"level": SKY_LEVEL} if options.outdoors else {}
     design = limits.CaptureDesign(**accepted(limits.CaptureDesign, options), **level)
     noise = emissivity.filter_noise(options.noise, table["band"].values.tolist())

@@ -10,8 +10,8 @@ from typing import Any, Final, Literal, get_args
 import numpy as np
 import xarray as xr
 
+from dbthermal import _text, schema
 from dbthermal import response as responses
-from dbthermal import schema
 from dbthermal._arrays import Array, Mask, stride
 from dbthermal.explorer import _films
 from dbthermal.explorer._films import FILMS, Pane, Progress, Region, Values, input_panes
@@ -27,8 +27,8 @@ _RANGE: Final = (12, 40_000)  # frames, and pixels of a frame, that give the ran
 class View:
     """Frames, ranges of colour and curves of a result or a capture, as the explorer shows them.
 
-    Films that are not in memory are copied into a temporary file (``TMPDIR``) when they are first
-    read: 4 bytes a pixel and frame on disk, and in memory a row of a store's chunks.
+    Films that are not in memory, or the small part of which a curve is asked, are copied into a
+    temporary file (``TMPDIR``): 4 bytes a pixel and frame, and in memory a row of a store's chunks.
 
     Parameters
     ----------
@@ -103,10 +103,11 @@ class View:
             if not np.isfinite(moment):
                 raise ValueError(f"Invalid time {moment} s of the event {name!r}. Must be finite.")
 
-    def pane(self, name: str) -> Pane:
-        """Pane by its name, copied so that a frame is read quickly; ValueError if unknown."""
-        if name not in self.panes:
-            raise ValueError(f"Unknown pane {name!r}. Must be one of {list(self.panes)}.")
+    def pane(self, name: str, *box: slice) -> Pane:
+        """Pane by its name, or of a box of it, copied to be read quickly; ValueError if unknown."""
+        _text.check_listed("Unknown pane", name, self.panes)
+        if box:
+            return self.panes[name].cut(box, self.progress)
         self.panes[name].stage(self.progress)
         return self.panes[name]
 
@@ -133,8 +134,7 @@ class View:
         Unflagged are measured and completed ones. Of measured pixels samples that were bridged in
         time do not count, either.
         """
-        if pixels not in get_args(Pixels):
-            raise ValueError(f"Unknown pixels {pixels!r}. Must be one of {list(get_args(Pixels))}.")
+        _text.check_listed("Unknown pixels", pixels, get_args(Pixels))
         if pixels == "all":
             return np.ones(self.shape, dtype=bool)
         good: Mask = self.status == 0
@@ -192,20 +192,20 @@ class View:
         temperature is mostly the prior of its drift (`SubspaceSettings.background_drift`): without
         a drift the mean is much closer.
         """
-        pane, mask = self.pane(name), region.mask(self.shape)
-        if pane.kind == "status":
+        if name == "status":
             raise ValueError("Invalid pane 'status'. Must be one with numbers.")
-        if not mask.any():
+        if not (mask := region.mask(self.shape)).any():
             raise ValueError(f"Invalid {region}: no pixel of the {self.shape} is inside it.")
         # Read the box around the region, some frames in one pass.
         box = tuple(slice(places.min(), places.max() + 1) for places in np.nonzero(mask))
-        where = (mask & self.counted(pixels))[box]
+        pane, where = self.pane(name, *box), (mask & self.counted(pixels))[box]
         gain, base = self._common(pane, box, where), name.removesuffix("_std")
-        contrast = [] if gain is None else [self.pane(film) for film in FILMS]
+        contrast = [] if gain is None else [self.pane(film, *box) for film in FILMS]
+        bars = self.pane(pane.std, *box) if pane.std else pane
 
         def statistics_of(frames: slice) -> dict[str, Array]:
             """Statistics of some frames of the region, at the pixels of its box that count."""
-            values, *films = (film.read(frames, *box)[:, where] for film in (pane, *contrast))
+            values, *films = (film.read(frames)[:, where] for film in (pane, *contrast))
             if pixels == "measured" and "bridged" in self.data and base in FILMS:
                 bridged = self.data["bridged"].isel(time=frames, y=box[0], x=box[1]).values
                 values = np.where(bridged[:, where], np.float32(np.nan), values)
@@ -214,7 +214,7 @@ class View:
             if pane.name.startswith("input "):
                 std, common = self._noise(pane, values), np.zeros(values.shape)
             elif pane.std:
-                std = self.pane(pane.std).read(frames, *box)[:, where].astype(np.float64)
+                std = bars.read(frames)[:, where].astype(np.float64)
             if gain is not None:
                 common = gain * np.abs(films[0] - films[1])
             # What the calibration is taken for is an error of all pixels, besides the noise.
@@ -230,7 +230,6 @@ class View:
         starts = range(0, self.time.size if pane.kind == "film" else 1, count)
         chunks = [statistics_of(slice(at, at + count)) for at in starts]
         values = {key: np.concatenate([chunk[key] for chunk in chunks]) for key in chunks[0]}
-        # Dataset over time, of a map without it.
         attrs = {"pane": name, "region": f"{region.kind} {region.points}", "selection": pixels}
         lines = {key: ("time", line, {"units": pane.units}) for key, line in values.items()}
         result = xr.Dataset(lines, attrs=attrs)

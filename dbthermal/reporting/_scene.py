@@ -119,7 +119,6 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
     result = view.data
     shot = result if view.capture is None else view.capture
     chosen = _chosen(view, regions)
-    # Curves of every region in every pane.
     shown = [name for name in view.panes if name in FILMS or name.startswith("emissivity ")]
     curves = {
         name: {pane: view.curve(pane, region, pixels="measured") for pane in shown}
@@ -145,7 +144,6 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
         doubts += against_response(view.capture, view.response)
     unit, zero = view.panes["object_temperature"].unit(celsius=celsius)
     emissivities = _emissivities(numbers, named=bool(regions))
-    # The page, which asks for nothing else.
     page, script = (resources.files(__package__) / name for name in ("page.html", "viewer.js"))
     environment = Environment(autoescape=True, trim_blocks=True)
     text = environment.from_string(page.read_text("utf-8")).render(
