@@ -19,17 +19,7 @@ from io import StringIO
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
-from dbthermal import __version__
-from dbthermal._cli import (
-    finite,
-    kelvin,
-    kelvin_or_path,
-    lines_of,
-    plain,
-    sources_and_targets,
-    stage_shown,
-    suggestion,
-)
+from dbthermal import __version__, _cli
 
 __all__ = ["main"]
 __dir__ = __all__.copy
@@ -48,10 +38,10 @@ _EXTRAS: Final = {
 _KINDS: Final[dict[str, Any]] = {
     "path": Path,
     "name": str,
-    "number": finite,
+    "number": _cli.finite,
     "n": int,
-    "temperature": kelvin,
-    "point": kelvin_or_path,
+    "temperature": _cli.kelvin,
+    "point": _cli.kelvin_or_path,
 }
 _ARGUMENTS: Final = """
 files path+             a file for each camera, or lists with '+' between the cameras; or a store
@@ -235,10 +225,10 @@ class _Parser(argparse.ArgumentParser):
         """Print the usage and the message, and exit."""
         names = ", ".join(self._option_string_actions)
         for wrong in re.findall(r"unrecognized arguments: (--\S+)", message):
-            message += suggestion(f"'{wrong}': choose from {names}")
+            message += _cli.suggestion(f"'{wrong}': choose from {names}")
         if self.epilog and re.match("unrecognized arguments: [^-]|the following", message):
             message += f". Must be as in: {self.epilog.splitlines()[1].strip()}"
-        super().error(message + suggestion(message))
+        super().error(message + _cli.suggestion(message))
 
     def parse_known_args(self, *arguments: Any, **named: Any) -> Any:
         """Options; the command refuses those that it does not know."""
@@ -316,8 +306,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         status, reason = 1, _reason(error, options)
         for name in vars(options):  # an argument of Python is named as the option is
             reason = re.sub(f" {name}=(?!b') ?", f" --{name.replace('_', '-')} ", reason)
-        reason = re.sub(r"--frames slice\((\d+), (\d+)\)", r"--frames \1 \2", reason)
-        reason += suggestion(reason)
+        reason = re.sub(r"--frames slice\((\d+), (\d+)(?:, \d+)?\)", r"--frames \1 \2", reason)
+        reason += _cli.suggestion(reason)
     print(_shown(f"dbthermal {options.command}: {reason}"), file=sys.stderr)
     return status
 
@@ -348,19 +338,19 @@ def _carry_out(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     module, function = options.place.split(".")
     if options.command == "record":
         return int(_command(module, function)(options))
-    with stage_shown(options.command):
+    with _cli.stage_shown(options.command):
         _command("files", "refuse_unused")(options, arguments)
-        sources, targets = sources_and_targets(options)
+        sources, targets = _cli.sources_and_targets(options)
         if options.dry_run:
             summary = _command("steps", "foreseen")(options, sources, targets)
         else:
             with ExitStack() as places:
                 for path in targets:  # which no other process writes to from here on
                     places.enter_context(import_module("dbthermal.store").reserved(path))
-                sources_and_targets(options)  # and to which none has written meanwhile
+                _cli.sources_and_targets(options)  # and to which none has written meanwhile
                 summary = _command(module, function)(options)
     # The summary, for programs or for people.
-    lines = [json.dumps(summary, default=plain)] if options.json else lines_of(summary)
+    lines = [json.dumps(summary, default=_cli.plain)] if options.json else _cli.lines_of(summary)
     print("\n".join(map(_shown, lines)), flush=True)
     return 0
 

@@ -29,6 +29,7 @@ TIFF: Final[dict[str, dict[str, Any]]] = {
     "tif": {"metadata": {"axes": "TYX"}},
     "big.tif": {"byteorder": ">"},
     "64.tif": {"bigtiff": True},
+    "tiles.tif": {"tile": (16, 16), "compression": "zlib"},
 }
 STORES: Final = {"zarr2": 2, "zarr3": 3}
 SEQUENCES: Final = ("sfmov", "hcc")

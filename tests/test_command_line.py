@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 import tifffile
 import xarray as xr
+import zarr
 from PIL import Image
 
 from dbthermal import __main__ as command_line
@@ -231,6 +232,13 @@ def test_info_of_stores_and_files(results: Path) -> None:
     one = done(results, "info", "a.tif", "--unit", "count", "--clock", "10")["a.tif"]
     assert one["stage"] == "recording of one band"
     assert one["attributes"]["byte_order"] == "little"
+    # Two cameras' files as the other commands name them, and two stores.
+    for names in (["a.tif", "b.tif"], ["a.tif", "+", "b.tif"]):
+        cameras = done(results, "info", *names, "--clock", "10", "12")
+        assert [*cameras] == ["a.tif", "b.tif"]
+        assert cameras["b.tif"]["frame_rate_Hz"] == pytest.approx(12)
+    stages = [it["stage"] for it in done(results, "info", "nuc.zarr", "scene.zarr").values()]
+    assert stages == ["correction", "capture"]
 
 
 @pytest.mark.parametrize("option", [[], ["--side-by-side"]])
@@ -413,6 +421,14 @@ def test_curves_films_pictures(results: Path) -> None:
     assert (results / "out.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_curves_of_pixels_copy_no_film(results: Path) -> None:
+    """A curve of few pixels is written where no file may be as large as a film of the result."""
+    limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (10**5,) * 2); "
+    places = ["--pixel", "3", "4", "--region", "2", "6", "10", "30", "-o", "few.csv"]
+    found = run(results, "export", "result.zarr", *places, before=limit)
+    assert found.returncode == 0, found.stderr
+
+
 def test_report_and_explorer(results: Path) -> None:
     """A report is a page with the region's name; the explorer's notebook has one valid cell."""
     shown = ["result.zarr", "aligned.zarr", "response.zarr"]
@@ -540,9 +556,15 @@ ROWS = f"""
 separate scene.zarr response.zarr -o x.zarr -> 'separate --correction' takes raw counts
 separate response.zarr aligned.zarr -o x.zarr -> Exchanged with the response
 separate scene.zarr response.zarr --correction response.zarr -o x.zarr -> calibrate --corr\\S+$
+import other.zarr -o x.zarr -> Invalid 1 files: .* two bands twice, with --variable for each
+import two.npz --bands a b -o x.zarr -> Invalid 1 files: .* twice, with --variable for each
+import two.npz two.npz --bands a b -o x.zarr -> one of the arrays .--variable. .* one of .'a', 'b'.
+separate a.tif response.zarr -o x.zarr -> No dataset 'a.tif'. Must be a zarr folder, as from: dbth
 import response.zarr -o x.zarr -> of stage 'response'. Must be of stage 'capture'
-info result.zarr scene.zarr -> Invalid list of 2 arrays. Must be one file or store.
-info a.tif b.tif --clock 10 -> Unordered files: .* Must be of one camera, and rise
+info result.zarr scene.zarr nuc.zarr -> Invalid list of 3 arrays. Must be one file or store.
+info a.tif b.tif five.tif --clock 10 -> Unordered files: .* Must be of one camera, and rise
+record a.tif new -> Invalid session 'a.tif'. Must be YAML, as params/sessions/scene.yaml.
+record folder new -> Invalid session 'folder'. Must be YAML
 align scene.zarr -o x.zarr -> Invalid capture .* of stage 'capture'. Must be of stage 'corrected'
 correct scene.zarr response.zarr -o x.zarr -> of stage 'response'. Must be of stage 'corr
 separate aligned.zarr response.zarr --offset 0 -o x.zarr -> Unused option --offset.
@@ -588,10 +610,15 @@ import a.tif b.tif --bands 8-14 9.5 10.6 -o x.zarr -> --bands of 3 names.* Must 
 import a.tif b.tif --bands 8-14 9.5 --clock 1 2 3 -o x.zarr -> Invalid --clock of 3 values
 export result.zarr --variable noise --variable status -o x.csv -> variable 'noise status' for .csv
 {ONE} --offset 0 --frames 0 -o x.zarr -> Invalid --frames .* first and end
-{ONE} --offset 0 --frames 300 400 -o x.zarr -> No frame or row of 'a.tif' selected
+{ONE} --offset 0 --frames 300 400 -o x.zarr -> --frames 300 400 of 'a.tif': it has 0 of these 100.
+{ONE} --offset 0 --frames 300 -o x.zarr -> --frames 300 of 'a.tif': it has 200 of these 300.
+{SWEEP} --frames 20 -> Invalid --frames 20 of the blackbody at 278.15 K: it has 16 of these 20.
+{ONE} --offset 0 --rows 20 30 -o x.zarr -> --rows 20 30 of 'a.tif': it has 4 of these 10.
+import scene.zarr --frames 150 300 --every 10 -o x.zarr -> of 'scene.zarr': it has 5 of these 15.
 {ONE} --offset 0 --every 0 -o x.zarr -> Invalid --every 0
 {ONE} --offset 0 --rows 9 3 -o x.zarr -> Invalid --rows 9 3
 seperate a b -> invalid choice: 'seperate' .choose from .*Did you mean 'separate'
+align corrected.zarr --register none --offset 100 -o x.zarr -> Invalid offset .* it leaves no frame
 align a.zarr --ofset 0 -o x.zarr -> unrecognized arguments: --ofset 0 Did you mean '--offset'
 align a.zarr --register homograph -o x.zarr -> 'homograph' .*Did you mean 'homography'
 export result.zarr --variable object -o x.tif -> 'object' for .tif.*mean 'object_temperature'
@@ -638,6 +665,8 @@ def mistaken(results: Path) -> Path:
         tifffile.imwrite(results / f"{name}.tif", wrong, photometric="minisblack")
     (results / "noise.tif").write_bytes(bytes(range(50)))
     (results / "folder").mkdir()
+    np.savez(results / "two.npz", a=stack, b=stack + np.uint16(1))
+    zarr.open_group(results / "other.zarr", mode="w").create_array("a", data=stack)
     return results
 
 

@@ -141,7 +141,7 @@ def suggestion(reason: str) -> str:
     wrong, names = unknown.group(1), re.findall(r"'([^']+)'", unknown.group(2))
     names = names or unknown.group(2).strip(" .)").split(", ")
     words = [name for name in names if wrong.lower() in name.lower()]
-    like = [*difflib.get_close_matches(wrong, names, 1), *words]
+    like = [*difflib.get_close_matches(wrong, names, 1, 0.7), *words]
     return f" Did you mean '{like[0]}'?" if like and like[0] != wrong else ""
 
 

@@ -84,7 +84,8 @@ def _regions(result: xr.Dataset, boxes: Iterable[Sequence[int]]) -> dict[str, ex
     for top, bottom, left, right in boxes:
         label = f"rows {top} to {bottom}, columns {left} to {right}"
         if not (0 <= top < bottom <= height and 0 <= left < right <= width):
-            raise ValueError(f"Invalid {label}. Must lie in the image of {height} x {width}.")
+            rule = f"Must lie in the image of {height} x {width}, and end after it begins"
+            raise ValueError(f"Invalid {label}. {rule}.")
         regions[label] = explorer.Region("rectangle", ((top, left), (bottom, right)))
     return regions
 
@@ -118,7 +119,6 @@ def _picture(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dic
     if options.variable == "status":
         store.save_figure(figures.status(result), path, provenance(options))
         return {"shape": list(result["status"].shape)}
-    # The last image, in degrees Celsius.
     array = result[options.variable]
     image = array.isel({dim: -1 for dim in array.dims if dim not in ("y", "x")})
     unit, label = array.attrs.get("units", "1"), str(array.name).replace("_", " ")

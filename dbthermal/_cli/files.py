@@ -19,6 +19,7 @@ from dbthermal._warnings import warned
 from dbthermal.explorer._answer import answer
 from dbthermal.readers import _formats as formats
 from dbthermal.response import ACCURACY
+from dbthermal.store import _integrity as integrity
 
 _MADE_BY = {
     "capture": "import",
@@ -92,19 +93,36 @@ def recording(paths: list[Path], options: argparse.Namespace, camera: int = 0) -
     if kind != "raw files":
         formats.refuse_text(paths[0])  # of a suffix that promises more
     stated = _arguments(reader, options, paths[0].name, camera)
-    dims = {"time": "frames", "y": "rows"} if "rows" in options else {}
-    selected = {dim: between(options, name) for dim, name in dims.items()}
-    if stated.pop("frames", None) and selected and "frames" in signature(reader).parameters:
-        stated["frames"] = selected.pop("time")
+    of_reader = ""  # what the reader selects, not all at hand
+    if stated.pop("frames", None) and "rows" in options:
+        stated["frames"], of_reader = between(options, "frames"), "frames"
     # Files of the kinds that make one recording together.
     several = kind in {"FLIR", "TIFF"}
     if len(paths) > 1 and not several:
         raise ValueError(f"Invalid list of {len(paths)} {kind}. Must be one file or store.")
     with on_disk(_room(options)):  # films that are large
-        movie = reader(paths if several else paths[0], **stated).isel(selected)
-    if not all(movie.sizes.values()):
-        raise ValueError(f"No frame or row of '{paths[0].name}' selected. Must be at least one.")
+        movie = reader(paths if several else paths[0], **stated)
+    movie = _selected(movie, options, paths[0], of_reader) if "rows" in options else movie
     return movie.assign_attrs(origin="simulated") if options.simulated else movie
+
+
+def _selected(
+    movie: xr.Dataset, options: argparse.Namespace, path: Path, of_reader: str = ""
+) -> xr.Dataset:
+    """Selected frames and rows; ValueError if some are not in the file or store."""
+    for name, dim in (("frames", "time"), ("rows", "y")):
+        part = between(options, name)
+        movie = movie if name == of_reader else movie.isel({dim: part})
+        check_all(movie.sizes[dim], options, name, f"'{path.name}'")
+    return movie
+
+
+def check_all(number: int, options: argparse.Namespace, name: str, label: str) -> None:
+    """Raise ValueError if fewer frames or rows than are selected are there."""
+    ends, part = vars(options)[name] or [], between(options, name)
+    if number < (wanted := len(range(part.start, part.stop or 0, part.step))):
+        rule = f"it has {number} of these {wanted}. Must have all"
+        raise ValueError(f"Invalid --{name} {' '.join(map(str, ends))} of {label}: {rule}.")
 
 
 def _arguments(
@@ -142,15 +160,13 @@ def between(options: argparse.Namespace, name: str, most: int | None = None) -> 
 
 def capture(paths: list[Path], options: argparse.Namespace, offset: Any) -> xr.Dataset:
     """Capture of two bands or more: a store, or the files of each camera, with '+' between."""
-    if len(paths) == 1 and (paths[0].suffix == ".zarr" or _is_store(paths[0])):
+    if len(paths) == 1 and _is_store(paths[0]):
         return staged(argparse.Namespace(capture=paths[0]), capture="capture|corrected")[0]
-    number = len(options.bands or "ab")
-    cameras = [[*group] for is_plus, group in groupby(paths, PLUS.__eq__) if not is_plus]
-    if PLUS not in paths and len(paths) in {2, number}:
-        cameras = [[path] for path in paths]
+    number, cameras = len(options.bands or "ab"), _cameras(paths, options.bands or "ab")
     if len(cameras) < 2 or paths.count(PLUS) not in {0, len(cameras) - 1}:
         label = f"Invalid {len(paths)} files: which are of the second camera is not clear"
-        raise ValueError(f"{label}. Must be one of each camera, or: a*.tif + b*.tif.")
+        rule = "a file of two bands twice, with --variable for each"
+        raise ValueError(f"{label}. Must be one of each camera, or: a*.tif + b*.tif; {rule}.")
     if options.bands is None:
         raise ValueError("Missing --bands. Must name all, such as: --bands 8-14 9.5.")
     for name, values in {"clock": options.clock or (), "variable": options.variable or ()}.items():
@@ -163,6 +179,13 @@ def capture(paths: list[Path], options: argparse.Namespace, offset: Any) -> xr.D
     movies = [recording(files, options, camera) for camera, files in enumerate(cameras)]
     with on_disk(_room(options)):
         return readers.two_bands(*movies, bands=options.bands, offset=offset)
+
+
+def _cameras(paths: list[Path], bands: Sequence[str] = "ab") -> list[list[Path]]:
+    """Files of each camera, with '+' between; without it, of two files or of all bands, one."""
+    if PLUS not in paths and len(paths) in {2, len(bands)}:
+        return [[path] for path in paths]
+    return [[*group] for is_plus, group in groupby(paths, PLUS.__eq__) if not is_plus]
 
 
 def _room(options: argparse.Namespace) -> Path:
@@ -178,7 +201,7 @@ def make_capture(options: argparse.Namespace) -> dict[str, Any]:
 
     scene = capture(options.files, options, options.offset)
     if options.files[0].is_dir() and len(options.files) == 1:
-        scene = scene.isel(time=between(options, "frames"), y=between(options, "rows"))
+        scene = _selected(scene, options, options.files[0])
     # What speaks against separating it later.
     stamps = scene.get("exposure_time", scene["time"])
     lengths = np.atleast_1d(stamps.max("time") - stamps.min("time"))
@@ -217,30 +240,30 @@ def provenance(options: argparse.Namespace) -> dict[str, Any]:
 
 def info(options: argparse.Namespace) -> dict[str, Any]:
     """Command `info`."""
-    paths: list[Path] = options.files
+    cameras = _cameras(options.files)
+    return {str(paths[0]): _described(paths, options, n) for n, paths in enumerate(cameras)}
+
+
+def _described(paths: list[Path], options: argparse.Namespace, camera: int) -> dict[str, Any]:
+    """Summary of a store, or of a camera's recording; its sizes even without a clock."""
     if len(paths) == 1 and _is_store(paths[0]) and options.unit is None:
-        return {str(paths[0]): summary(opened(paths[0]), everything=True)}
-    # A recording; without a clock its sizes can be said all the same.
-    unknown = False
+        return summary(opened(paths[0]), everything=True)
     try:
-        dataset = recording(paths, options)
+        return summary(recording(paths, options, camera), everything=True)
     except ValueError as error:
         if options.clock is not None or not re.match("Missing (--)?clock", str(error)):
             raise
-        options.clock, unknown = [1.0], True
-        dataset = recording(paths, options)
-    lines = summary(dataset, everything=True)
-    if unknown:
-        lines = {name: value for name, value in lines.items() if name not in _BY_CLOCK}
-        lines["clock"] = "not in the file: state the frame rate by --clock"
-    return {str(paths[0]): lines}
+    options = argparse.Namespace(**{**vars(options), "clock": [1.0]})  # any
+    lines = _described(paths, options, camera)
+    lines = {name: value for name, value in lines.items() if name not in _BY_CLOCK}
+    return lines | {"clock": "not in the file: state the frame rate by --clock"}
 
 
 def _is_store(path: Path) -> bool:
     """Tell whether a folder is a store of dbthermal or a part of one, not one of other programs."""
     group, member = path.parent / "zarr.json", path / "zarr.json"
-    if not member.is_file():
-        return False
+    if (path / integrity.SUMS).is_file() or not member.is_file():
+        return (path / integrity.SUMS).is_file()
     text = (group if group.is_file() else member).read_text(encoding="utf-8", errors="replace")
     return "provenance" in text or "frames_written" in text or '"attributes"' not in text
 

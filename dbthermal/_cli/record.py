@@ -24,7 +24,9 @@ from dbthermal.instruments.session import Session
 
 def record(options: argparse.Namespace) -> int:
     """Record a session, and return the exit status; a dry run only opens and names the devices."""
-    session = Session.load(options.session)
+    if (path := options.session).suffix.lower() not in {".yaml", ".yml"} and path.exists():
+        raise ValueError(f"Invalid session '{path}'. Must be YAML, as params/sessions/scene.yaml.")
+    session = Session.load(path)
     session = replace(session, simulated=True) if options.simulate else session
     try:
         with raised_signals():

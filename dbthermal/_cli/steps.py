@@ -119,7 +119,6 @@ def calibrate(options: argparse.Namespace) -> dict[str, Any]:
     if len(stated) != 1:
         label = f"Invalid sources {stated}" if stated else "Missing source"
         raise ValueError(f"{label}. Must be one of --at, --blackbody, --sweep or --maker.")
-    # The constants of the cameras' maker.
     if options.maker:
         response = calibration.maker_response(files.opened(options.maker).attrs.get("files", {}))
         return files.saved(response, options)
@@ -152,7 +151,6 @@ def _blackbody(options: argparse.Namespace) -> xr.Dataset:
         from dbthermal.instruments import recording  # noqa: PLC0415 - optional
 
         return recording.open_sweep(*options.sweep, frames=frames.stop)
-    # Files of each temperature.
     movies = []
     for temperature, *paths in options.at:
         if isinstance(temperature, Path):
@@ -162,6 +160,7 @@ def _blackbody(options: argparse.Namespace) -> xr.Dataset:
         good = np.arange(still.sizes["time"])
         if "exposure_time" in still:  # padded and damaged frames have none
             good = np.flatnonzero(still["exposure_time"].notnull().all("band"))
+        files.check_all(good[frames].size, options, "frames", f"the blackbody at {temperature:g} K")
         movie = still[["counts"]].isel(time=good[frames]).load().drop_vars("time")
         movies.append(movie.rename(time="frame").expand_dims(temperature=[temperature]))
     # All temperatures have the frames of the shortest recording.
@@ -294,14 +293,12 @@ def foreseen(
 
 def plan(options: argparse.Namespace) -> dict[str, Any]:
     """Command `plan`."""
-    # Materials, all or those that are named.
     table = emissivity.embedded_table()
     if options.materials:
         names = table["material"].values.tolist()
         for name in (name for name in options.materials if name not in names):
             raise ValueError(f"Unknown material '{name}'. Must be one of {names}.")
         table = table.sel(material=[*dict.fromkeys(options.materials)])
-    # Plan of the capture, and its best filter by material.
     level = {"level": SKY_LEVEL} if options.outdoors else {}
     design = limits.CaptureDesign(**accepted(limits.CaptureDesign, options), **level)
     noise = emissivity.filter_noise(options.noise, table["band"].values.tolist())

@@ -44,8 +44,9 @@ def align(
     Interpolation makes the noise of a band smaller, by up to 0.8 (`noise_factor`), and correlates
     neighbouring frames.
 
-    TypeError or ValueError if an argument is not as described, no offset is found, or a band's
-    clock was set while it ran: its stamps step, and the images go on as without the step.
+    TypeError or ValueError if an argument is not as described, no offset is found, one leaves no
+    frame that all bands have, or a band's clock was set while it ran: its stamps step, and the
+    images go on as without the step.
 
     Parameters
     ----------
@@ -91,9 +92,8 @@ def align(
     Warns
     -----
     UserWarning
-        If an offset leaves no frame of a band; if the clocks of cameras apart seem to be off by
-        more than a tenth of a frame still; if the images contradict an offset that was stated to
-        `readers.two_bands`, and are followed.
+        If the clocks of cameras apart seem to be off by more than a tenth of a frame still; if the
+        images contradict an offset that was stated to `readers.two_bands`, and are followed.
 
     Examples
     --------

@@ -12,7 +12,6 @@ from scipy.sparse import csr_array, diags_array, eye_array
 from dbthermal import _numbers, _rows, schema
 from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
-from dbthermal._warnings import warned
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment._offset import SEARCH, noise_levels, require_one_clock, sample, time_offset
 from dbthermal.alignment._splines import Movie
@@ -241,14 +240,12 @@ def on_one_clock(
             plan.apply(movie, result[band], largest)
         return result
 
+    if not np.all([plan.valid for plan in plans], axis=0).any():
+        label = f"Invalid offset {offsets.tolist()} s: it leaves no frame that all bands have"
+        raise ValueError(f"{label}. Must be in seconds, and the recordings overlap.")
     lost = [int(np.count_nonzero(~plan.valid)) for plan in plans]
     movie = _rows.lazy(aligned, counts) if lazy else counts.copy(data=aligned(slice(None)))
     result = _assembled(corrected, movie, times)
-    # Warn of bands of which no frame is left.
-    rule = f"at offsets of {offsets.tolist()} s: are they in seconds, do the recordings overlap?"
-    outside = (stamps.max(axis=1) < times.min()) | (stamps.min(axis=1) > times.max())
-    gone = [name for name, away in zip(names, outside, strict=True) if away]
-    result = warned(result, *(f"No frame of band '{name}' is left {rule}" for name in gone))
     factors = factors * schema.noise_factor(corrected)
     result = result.assign(noise_factor=("band", factors, schema.NOISE_FACTOR.attrs))
     return result.assign_attrs(

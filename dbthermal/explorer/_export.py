@@ -69,7 +69,6 @@ def figure(view: View, shown: Shown) -> Figure:
         for place, region in enumerate(shown.regions.values()):
             color = drawing.COLORS[place % len(drawing.COLORS)]
             axis.add_patch(_outline(region, fill=False, edgecolor=color, linewidth=1.5))
-    # Time and origin of the data.
     note = drawing.provenance_note(view.data)
     result.suptitle(f"{view.time[shown.index]:.2f} s{note}", fontsize=10)
     return result

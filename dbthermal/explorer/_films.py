@@ -2,11 +2,11 @@
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from tempfile import gettempdir
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +14,7 @@ import xarray as xr
 from scipy.constants import zero_Celsius
 from scipy.special import chdtri
 
-from dbthermal import _rows, schema, store
+from dbthermal import _rows, _text, schema, store
 from dbthermal import response as responses
 from dbthermal._arrays import Array, Mask, empty, on_disk, release
 from dbthermal._coordinates import laid_on
@@ -28,9 +28,8 @@ FILMS: Final = {
     "background_temperature": "reflected temperature",
 }
 _LEAST_PAIRS: Final = 12  # pairs of neighbours that give the share of independent errors
-_LARGEST_SHARE: Final = (
-    2.0  # of independent errors in the variance, beyond which it is the material
-)
+_LARGEST_SHARE: Final = 2.0  # of independent errors in the variance; beyond, of the material
+_FEW: Final = 4  # parts of the image, of which one is copied by itself
 _LEAST: Final = {"rectangle": (2, 2), "ellipse": (2, 2), "polygon": (3, 1000)}
 _ONE_BAND: Final = schema.Variable(("time", "y", "x"), "uint16", "count", "raw signal")
 
@@ -79,6 +78,14 @@ class Pane:
                 progress(f"reading {self.label}", block.stop / array.shape[1])
             release()
         vars(self)["_source"] = copy
+
+    def cut(self, box: tuple[slice, ...], progress: Progress | None) -> "Pane":
+        """Pane of some rows and columns: if they are few, no more of a film is copied."""
+        part = replace(self, array=self.array.isel(y=box[0], x=box[1]))
+        if "_source" in vars(self) or _FEW * part.array.size > self.array.size:
+            self.stage(progress)
+            vars(part)["_source"] = self._source[:, *box]
+        return part
 
     def read(
         self, frames: slice, rows: slice = slice(None), columns: slice = slice(None)
@@ -191,9 +198,7 @@ class Region:
     points: tuple[tuple[float, float], ...]
 
     def __post_init__(self) -> None:
-        if self.kind not in get_args(Kind):
-            label = f"Unknown kind of region {self.kind!r}"
-            raise ValueError(f"{label}. Must be one of {list(_LEAST)}.")
+        _text.check_listed("Unknown kind of region", self.kind, _LEAST)
         try:
             points = tuple((float(row), float(column)) for row, column in self.points)
         except (TypeError, ValueError) as error:

@@ -10,23 +10,11 @@ from typing import Any, Final, Literal, get_args
 import numpy as np
 import xarray as xr
 
+from dbthermal import _text, schema
 from dbthermal import response as responses
-from dbthermal import schema
 from dbthermal._arrays import Array, Mask, stride
-from dbthermal.explorer._films import (
-    FILMS,
-    Pane,
-    Progress,
-    Region,
-    Values,
-    common_gain,
-    input_panes,
-    marks,
-    mean_std,
-    opened,
-    result_panes,
-    statistics,
-)
+from dbthermal.explorer import _films
+from dbthermal.explorer._films import FILMS, Pane, Progress, Region, Values, input_panes
 from dbthermal.schema import Status
 
 Pixels = Literal["unflagged", "measured", "all"]
@@ -39,8 +27,8 @@ _RANGE: Final = (12, 40_000)  # frames, and pixels of a frame, that give the ran
 class View:
     """Frames, ranges of colour and curves of a result or a capture, as the explorer shows them.
 
-    Films that are not in memory are copied into a temporary file (``TMPDIR``) when they are first
-    read: 4 bytes a pixel and frame on disk, and in memory a row of a store's chunks.
+    Films that are not in memory, or the small part of which a curve is asked, are copied into a
+    temporary file (``TMPDIR``): 4 bytes a pixel and frame, and in memory a row of a store's chunks.
 
     Parameters
     ----------
@@ -64,9 +52,8 @@ class View:
     Raises
     ------
     TypeError, ValueError
-        If the data are neither a Dataset nor a path; if there is no temperature and no counts, a
-        variable is not as `schema` says, the capture has other frames, pixels or bands, or an event
-        is not at a finite time.
+        If the data are no Dataset or path, or have neither temperature nor counts; a variable is
+        not as `schema` says; the capture has other frames, pixels or bands; or a time is infinite.
 
     Examples
     --------
@@ -88,10 +75,10 @@ class View:
         events: Mapping[str, float] = MappingProxyType({}),
     ) -> None:
         self.progress: Progress | None = None
-        self.data = opened(data, "data")
+        self.data = _films.opened(data, "data")
         is_capture = "object_temperature" not in self.data and "counts" in self.data
-        self.capture = None if capture is None else opened(capture, "capture")
-        self.response = None if response is None else opened(response, "response")
+        self.capture = None if capture is None else _films.opened(capture, "capture")
+        self.response = None if response is None else _films.opened(response, "response")
         sources = {"result": data, "capture": capture, "response": response}
         if is_capture and capture is not None:
             raise ValueError("Invalid second capture. The data are a capture: must be a result.")
@@ -104,22 +91,23 @@ class View:
         }
         reference = self.data if is_capture else self.data.get("object_temperature")
         inputs = [] if self.capture is None else input_panes(self.capture, self.response, reference)
-        results = [] if is_capture else result_panes(self.data)
+        results = [] if is_capture else _films.result_panes(self.data)
         self.panes = {pane.name: pane for pane in (*inputs, *results)}
         film = next(iter(self.panes.values())).array
         self.time = film["time"].values.astype(np.float64)
         self.shape: tuple[int, int] = film.shape[1], film.shape[2]
         shown = self.data if self.capture is None else self.capture
         stated = {name: float(moment) for name, moment in events.items()}
-        self.events = marks(shown, self.time) | stated
+        self.events = _films.marks(shown, self.time) | stated
         for name, moment in self.events.items():
             if not np.isfinite(moment):
                 raise ValueError(f"Invalid time {moment} s of the event {name!r}. Must be finite.")
 
-    def pane(self, name: str) -> Pane:
-        """Pane by its name, copied so that a frame is read quickly; ValueError if unknown."""
-        if name not in self.panes:
-            raise ValueError(f"Unknown pane {name!r}. Must be one of {list(self.panes)}.")
+    def pane(self, name: str, *box: slice) -> Pane:
+        """Pane by its name, or of a box of it, copied to be read quickly; ValueError if unknown."""
+        _text.check_listed("Unknown pane", name, self.panes)
+        if box:
+            return self.panes[name].cut(box, self.progress)
         self.panes[name].stage(self.progress)
         return self.panes[name]
 
@@ -146,8 +134,7 @@ class View:
         Unflagged are measured and completed ones. Of measured pixels samples that were bridged in
         time do not count, either.
         """
-        if pixels not in get_args(Pixels):
-            raise ValueError(f"Unknown pixels {pixels!r}. Must be one of {list(get_args(Pixels))}.")
+        _text.check_listed("Unknown pixels", pixels, get_args(Pixels))
         if pixels == "all":
             return np.ones(self.shape, dtype=bool)
         good: Mask = self.status == 0
@@ -205,36 +192,36 @@ class View:
         temperature is mostly the prior of its drift (`SubspaceSettings.background_drift`): without
         a drift the mean is much closer.
         """
-        pane, mask = self.pane(name), region.mask(self.shape)
-        if pane.kind == "status":
+        if name == "status":
             raise ValueError("Invalid pane 'status'. Must be one with numbers.")
-        if not mask.any():
+        if not (mask := region.mask(self.shape)).any():
             raise ValueError(f"Invalid {region}: no pixel of the {self.shape} is inside it.")
         # Read the box around the region, some frames in one pass.
         box = tuple(slice(places.min(), places.max() + 1) for places in np.nonzero(mask))
-        where = (mask & self.counted(pixels))[box]
+        pane, where = self.pane(name, *box), (mask & self.counted(pixels))[box]
         gain, base = self._common(pane, box, where), name.removesuffix("_std")
-        contrast = [] if gain is None else [self.pane(film) for film in FILMS]
+        contrast = [] if gain is None else [self.pane(film, *box) for film in FILMS]
+        bars = self.pane(pane.std, *box) if pane.std else pane
 
         def statistics_of(frames: slice) -> dict[str, Array]:
             """Statistics of some frames of the region, at the pixels of its box that count."""
-            values, *films = (film.read(frames, *box)[:, where] for film in (pane, *contrast))
+            values, *films = (film.read(frames)[:, where] for film in (pane, *contrast))
             if pixels == "measured" and "bridged" in self.data and base in FILMS:
                 bridged = self.data["bridged"].isel(time=frames, y=box[0], x=box[1]).values
                 values = np.where(bridged[:, where], np.float32(np.nan), values)
-            result = statistics(values)
+            result = _films.statistics(values)
             std = common = np.full(values.shape, np.nan)
             if pane.name.startswith("input "):
                 std, common = self._noise(pane, values), np.zeros(values.shape)
             elif pane.std:
-                std = self.pane(pane.std).read(frames, *box)[:, where].astype(np.float64)
+                std = bars.read(frames)[:, where].astype(np.float64)
             if gain is not None:
                 common = gain * np.abs(films[0] - films[1])
             # What the calibration is taken for is an error of all pixels, besides the noise.
             finite, shared = np.isfinite(values), self._shared(pane, values, box, where)
             if pane.std:
                 std = np.sqrt(np.maximum(std**2 - shared**2, 0.0))
-            std = mean_std(np.where(finite, std, np.nan), common)
+            std = _films.mean_std(np.where(finite, std, np.nan), common)
             shared_std = np.sum(shared, axis=-1, where=finite) / np.maximum(result["pixels"], 1)
             shared_std = np.where(result["pixels"] > 0, shared_std, np.nan)
             return {**result, "std": np.hypot(std, shared_std), "calibration_std": shared_std}
@@ -243,7 +230,6 @@ class View:
         starts = range(0, self.time.size if pane.kind == "film" else 1, count)
         chunks = [statistics_of(slice(at, at + count)) for at in starts]
         values = {key: np.concatenate([chunk[key] for chunk in chunks]) for key in chunks[0]}
-        # Dataset over time, of a map without it.
         attrs = {"pane": name, "region": f"{region.kind} {region.points}", "selection": pixels}
         lines = {key: ("time", line, {"units": pane.units}) for key, line in values.items()}
         result = xr.Dataset(lines, attrs=attrs)
@@ -268,7 +254,7 @@ class View:
             variance = cut["emissivity_std"].values ** 2
             covariance = np.eye(len(variance))[..., None, None] * variance
         measured = where & ((self.status[box] & COMPLETED) == 0)
-        gains = common_gain(np.where(measured, cut["emissivity"].values, np.nan), covariance)
+        gains = _films.common_gain(np.where(measured, cut["emissivity"].values, np.nan), covariance)
         return np.asarray(gains[list(FILMS).index(pane.name)][where])
 
     def _shared(self, pane: Pane, values: Values, box: tuple[slice, ...], where: Mask) -> Array:

@@ -37,9 +37,8 @@ def array(
 
     The Dataset is as from `tiff`, and so are the errors for unit, clock, memory and 8 bits.
     FileNotFoundError if there is no file, ImportError without the extra ``recordings`` for HDF5 and
-    NetCDF 4; TypeError or ValueError if a file is of another format, or damaged; the array is not
-    one of three dimensions and uint16, has other dims, is scaled, lacks values, has times that the
-    clock contradicts, or is not in the file.
+    NetCDF 4; TypeError or ValueError if a file is damaged or of another format; the array is not of
+    (time, y, x) and uint16, is scaled, lacks values, or has times that the clock contradicts.
 
     Parameters
     ----------
@@ -114,7 +113,7 @@ def _checked(values: Any, label: str, unit: str) -> dict[str, Any]:
     dtype = np.dtype(getattr(values, "dtype", object))
     unsigned = str(attributes.get("_Unsigned", "")).lower() in {"true", "1"}
     if dtype.itemsize != 2 or dtype.kind not in ("iu" if unsigned else "u"):
-        rule = "Must be uint16: counts, neither temperatures nor objects; convert whole numbers"
+        rule = "Must be uint16 (in NetCDF 3 short, _Unsigned='true'): counts; convert whole numbers"
         raise ValueError(f"Invalid dtype {dtype} of '{label}'. {rule}.")
     text = str(attributes.get("units", attributes.get("unit", unit))).strip()
     _recording.check_unit(unit if text in {"", "1"} else text, label)

@@ -89,10 +89,9 @@ def flir(
     pixel or, in JPEG-LS, one flipped bit in ten changes counts without complaint.
 
     OSError if a file cannot be opened, ImportError without the extra ``recordings`` for compressed
-    ones; TypeError or ValueError if a file is no FLIR recording, damaged or truncated, or takes too
-    much memory; frames differ in size or in the maker's constants; the byte order is unclear or
-    contradicts the image; the counts have 8 bits; the times are unknown or fall; or memory is no
-    number.
+    ones; TypeError or ValueError if a file is no FLIR recording, damaged or too large; frames differ
+    in size or in the maker's constants; the byte order is unclear or contradicts the image; the
+    counts have 8 bits; or the times are unknown or fall.
 
     Parameters
     ----------
@@ -136,7 +135,7 @@ def flir(
             raise ValueError(f"Invalid frames {frames}. Must be >= 0, and the step > 0.") from error
         listed = [*selected]
         if not listed:
-            raise ValueError(f"No frames {frames} in '{name}'. Must select at least one.")
+            raise ValueError(f"Invalid frames={frames} of '{name}'. Must select at least one.")
         # Images, all of the form of the first.
         form = _image(*listed[0], stated)._replace(body=b"")
         stored = sum(file.stat().st_size for file in paths)

@@ -185,10 +185,10 @@ def array_name(names: Collection[str], name: str | None, path: Path, shapes: Seq
     if name in [*names]:
         return str(name)
     if not names:
-        rule = "Must have one; a store of dbthermal that has two bands is a capture as it is"
+        rule = "Must have one: save each band by itself; a store of dbthermal is a capture as it is"
         label = f"'{path.name}', which has {', '.join(shapes[:3]) or 'none'}"
         raise ValueError(f"Missing array (time, y, x) in {label}. {rule}.")
-    wanted = "name of one of the arrays" if name is None else f"array '{name}'"
+    wanted = "name of one of the arrays (--variable)" if name is None else f"array '{name}'"
     raise ValueError(f"Missing {wanted} in '{path.name}'. Must be one of {sorted(names)}.")
 
 

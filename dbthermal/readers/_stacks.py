@@ -28,7 +28,6 @@ _FORM: Final = (
     ("is_reduced", "preview", False, "False: a frame, not a smaller copy of one"),
     ("samplesperpixel", "values of a pixel", 1, "1: counts, not colours"),
     ("fillorder", "order of bits", 1, "1: the highest bit first"),
-    ("is_tiled", "tiled pages", False, "False: save it in strips, as by tiffcp -s"),
     (262, "photometric interpretation", 1, "1: more counts are whiter"),
     (274, "orientation", 1, "1: rows from the top, columns from the left; save it upright"),
 )
@@ -39,6 +38,7 @@ _METADATA, _NO_DATA = 42112, 42113  # tags of GDAL
 _SCALING: Final = re.compile(r"<Item\b[^<>]{0,200}\brole=.(scale|offset).[^<>]{0,200}>([^<]*)")
 _LOSSLESS: Final = "LZW, deflate, PackBits, LZMA, Zstandard"
 _AT_ONCE: Final = 2**25  # of a span [byte]
+_TILE: Final = 2**19  # that tiles may have beyond 8 times their image [byte]
 # A unit of the values in a description: as ImageJ, and as JSON, write it.
 _TEMPERATURES: Final = re.compile(
     r"""(?im)\b(?:v|value[ _]?)?units?["']?\s*[:=]\s*["']?(?:[0-9./]+ ?)?"""
@@ -70,10 +70,9 @@ def tiff(
     of ImageJ or OME must agree with the clock, or serves as one; "origin: simulated" is kept.
 
     OSError if a file cannot be opened, ImportError without the extra ``recordings``; TypeError or
-    ValueError if the unit is another one; a file is no TIFF, damaged, has fewer pages than it
-    states, two bands in one, or other axes; a page is compressed with loss, in tiles, in colours,
-    not of 16 bits, of another size, a preview, mirrored, rotated, scaled (GDAL), or white where it
-    is 0; counts are missing, take too much memory or have 8 bits; or the clock is wrong.
+    ValueError if the unit is another one; a file is damaged, or holds two bands or other axes; a
+    page has no 16-bit counts, or they are missing, scaled, mirrored, rotated, inverted, compressed
+    with loss or of another size; they take too much memory or have 8 bits; or the clock is wrong.
 
     Parameters
     ----------
@@ -183,6 +182,7 @@ class _Page(NamedTuple):
     missing: list[float]
     codec: str = ""
     rows: int = 0  # of a span, where they are compressed
+    tile: int = 0  # columns of a tile, of which a row of images is made; 0 of strips
     differences: bool = False  # from column to column
     description: str = ""
 
@@ -192,25 +192,31 @@ def _values(page: _Page) -> Iterator[Counts]:
     if page.codec == "png":
         yield _recording.png(page.path.read_bytes(), f"'{page.path.name}'").ravel()
         return
+    width, row = page.tile or page.shape[1], list[Counts]()  # of tiles that lie side by side
+    across = -(-page.shape[1] // width)
     for number, (start, length) in enumerate(page.spans):
-        if not page.codec:
+        if not page.codec and not page.tile:
             for place in range(start, start + length, _AT_ONCE):
                 size = min(_AT_ONCE, start + length - place) // 2
                 yield np.fromfile(page.path, f"{page.order}u2", size, offset=place)
             continue
-        stored = np.fromfile(page.path, np.uint8, length, offset=start).tobytes()
-        rows = min(page.rows, page.shape[0] - number * page.rows)
-        size = 2 * rows * page.shape[1]
-        decode = getattr(_recording.optional("imagecodecs", "recordings"), f"{page.codec}_decode")
-        with _recording.damage_named(f"Damaged TIFF '{page.path.name}'", f"whole {page.codec}"):
-            content = decode(stored, out=size + 1)  # and no more
+        content = np.fromfile(page.path, np.uint8, length, offset=start).tobytes()
+        rest = page.shape[0] - number // across * page.rows
+        rows = page.rows if page.tile else min(page.rows, rest)
+        size = 2 * rows * width
+        if page.codec:
+            codecs = _recording.optional("imagecodecs", "recordings")
+            decode = getattr(codecs, f"{page.codec}_decode")
+            with _recording.damage_named(f"Damaged TIFF '{page.path.name}'", f"whole {page.codec}"):
+                content = decode(content, out=size + 1)  # and no more
         if len(content) != size:
-            label = f"{len(content)} bytes of a strip of '{page.path.name}'"
+            label = f"{len(content)} bytes of a strip or tile of '{page.path.name}'"
             raise ValueError(f"Damaged TIFF: {label}. Must be {size}, as its page states.")
         values = np.frombuffer(content, f"{page.order}u2").reshape(rows, -1)
-        if page.differences:
-            values = np.cumsum(values, axis=1, dtype=np.uint16)
-        yield values.ravel()
+        row.append(np.cumsum(values, axis=1, dtype=np.uint16) if page.differences else values)
+        if len(row) == across:
+            yield np.hstack(row)[:rest, : page.shape[1]].ravel()
+            row.clear()
 
 
 def _pages(path: Path) -> list[_Page]:
@@ -250,7 +256,8 @@ def _pages(path: Path) -> list[_Page]:
     finally:
         log.removeHandler(handler)
     # Number of the pages, as the description states it.
-    if len(pages) == 1 and stated > 1 and not pages[0].codec:  # as ImageJ beyond 4 GB, without gaps
+    packed = pages[0].codec or pages[0].tile
+    if len(pages) == 1 and stated > 1 and not packed:  # as ImageJ beyond 4 GB, without gaps
         (start, length), *further = pages[0].spans
         if further or start + stated * length > size:
             label = f"Truncated TIFF '{path.name}': {stated} images of {length} bytes at {start}"
@@ -280,8 +287,9 @@ def _check_apart(file: Any, pages: list[_Page]) -> None:
 
 def _page(page: Any, path: Path, order: str, number: int) -> _Page:
     """Page of tifffile, as one image of uncompressed counts."""
-    if page.compression == 1 and page.dtype is not None and page.dtype.kind == "f":
+    if page.dtype is not None and page.dtype.kind == "f":
         length = min(page.databytecounts[0], path.stat().st_size) // page.dtype.itemsize
+        length = length if page.compression == 1 else 0
         form = page.dtype.newbyteorder(order)
         values = np.fromfile(path, form, length, offset=page.dataoffsets[0])
         values = values[np.isfinite(values)]
@@ -306,16 +314,23 @@ def _page(page: Any, path: Path, order: str, number: int) -> _Page:
         if start < 8 or length < 1 or odd or start + length > path.stat().st_size:
             label = f"{length} bytes at {start} of page {number}"
             raise ValueError(f"Truncated: {label}. Must be within {path.stat().st_size}.")
-        joined = spans and sum(spans[-1]) == start and not codec
+        joined = spans and sum(spans[-1]) == start and not codec and not page.is_tiled
         begun, before = spans.pop() if joined else (start, 0)
         spans.append((int(begun), int(before + length)))
+    # Strips or tiles, as many as cover it.
     total, rows = sum(length for _, length in spans), min(int(page.rowsperstrip), shape[0])
-    if not math.prod(shape) or not (total == 2 * math.prod(shape) if not codec else rows):
+    tile, rows = (int(page.tilewidth), int(page.tilelength)) if page.is_tiled else (0, rows)
+    if not math.prod(shape) or not (rows if codec or tile else total == 2 * math.prod(shape)):
         raise ValueError(f"Truncated: {total} bytes of page {number}. Must be 2 x {shape}.")
-    if codec and len(spans) != -(-shape[0] // rows):
-        label = f"{len(spans)} strips of page {number}"
-        raise ValueError(f"Truncated: {label}. Must be of {rows} rows.")
-    return _Page(path, shape, 1, order, spans, _no_data(page, number), codec, rows, predictor == 2)
+    pieces = -(-shape[0] // rows) * -(-shape[1] // (tile or shape[1]))
+    if (codec or tile) and len(spans) != pieces:
+        label = f"{len(spans)} strips or tiles of page {number}"
+        raise ValueError(f"Truncated: {label}. Must be {pieces} of {rows} rows.")
+    if tile and 2 * pieces * rows * tile > (most := max(_TILE, 16 * math.prod(shape))):
+        label = f"{pieces} tiles of {rows} x {tile} of page {number}"
+        raise ValueError(f"Invalid {label}. Must be at most {most} bytes, of {shape}.")
+    form = (codec, rows, tile, predictor == 2)
+    return _Page(path, shape, 1, order, spans, _no_data(page, number), *form)
 
 
 def _no_data(page: Any, number: int) -> list[float]:
@@ -341,7 +356,8 @@ def _stated(description: str) -> int:
         named = zip(dims[:-2], shape, strict=False)
         names = "".join(name for name, size in named if size != 1) + dims[-2:]
     if sum(size > 1 for size in axes) > 1:
-        raise ValueError(f"Invalid axes of {axes} images. Must be one, time: a band is a file.")
+        rule = "Must be one, time: save each band as a file, as by ImageJ's Split Channels"
+        raise ValueError(f"Invalid axes of {axes} images. {rule}.")
     if not _OVER_TIME.fullmatch(names):
         rule = "Must be TYX, time, rows and columns: a band is a file"
         raise ValueError(f"Invalid axes {names} of the images. {rule}.")

@@ -34,9 +34,8 @@ def two_bands(
     `alignment.align` bring all onto one clock: cameras' dates are hardly ever right to a frame.
 
     TypeError or ValueError if a recording is not one of counts in one band, or its times are
-    unknown, infinite or fall; bands are not different names, one for each; sizes differ; an offset
-    is no number, or there is none and no date; recordings do not overlap in time, or hold the same
-    counts.
+    unknown or fall; bands are not different names, one for each; sizes differ; there is no offset
+    and no date; or recordings do not overlap in time, or hold the same counts.
 
     Parameters
     ----------

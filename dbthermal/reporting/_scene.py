@@ -119,7 +119,6 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
     result = view.data
     shot = result if view.capture is None else view.capture
     chosen = _chosen(view, regions)
-    # Curves of every region in every pane.
     shown = [name for name in view.panes if name in FILMS or name.startswith("emissivity ")]
     curves = {
         name: {pane: view.curve(pane, region, pixels="measured") for pane in shown}
@@ -145,17 +144,13 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
         doubts += against_response(view.capture, view.response)
     unit, zero = view.panes["object_temperature"].unit(celsius=celsius)
     emissivities = _emissivities(numbers, named=bool(regions))
-    # The page, which asks for nothing else.
     page, script = (resources.files(__package__) / name for name in ("page.html", "viewer.js"))
     environment = Environment(autoescape=True, trim_blocks=True)
     text = environment.from_string(page.read_text("utf-8")).render(
         title=title,
         origin=result.attrs.get("origin") or shot.attrs.get("origin", "origin not stated"),
         about=", ".join(filter(None, about)),
-        answer=[
-            sentence.replace("+-", "\N{PLUS-MINUS SIGN}").replace("degC", "\N{DEGREE SIGN}C")
-            for sentence in sentences
-        ],
+        answer=sentences,
         logo="" if logo is None else base64_text(_picture(logo)),
         numbers=numbers,
         scene=sentence,
@@ -379,9 +374,8 @@ def viewer(view: View, *, celsius: bool) -> dict[str, Any]:
     colors = np.rint(255 * mpl.colormaps["inferno"](np.linspace(0, 1, 256))[:, :3]).astype(np.uint8)
     # Pixels that are completed (1), or have another flag (2).
     status = view.status[::step, ::step]
-    completed = (status & COMPLETED) != 0
-    marks = np.where(completed, 1, np.where(status != 0, 2, 0)).astype(np.uint8)
-    content = {
+    marks = np.where((status & COMPLETED) != 0, 1, np.where(status != 0, 2, 0)).astype(np.uint8)
+    return {
         "marks": base64_text(marks.tobytes()),
         "height": -(-view.shape[0] // step),
         "width": -(-view.shape[1] // step),
@@ -390,9 +384,3 @@ def viewer(view: View, *, celsius: bool) -> dict[str, Any]:
         "palette": base64_text(colors.tobytes()),
         "quantities": quantities,
     }
-    share = f"one row and column of {step}, " if step > 1 else ""
-    note = (
-        "Click a pixel for its curve. White lines: completed, not measured. Black lines: flagged. "
-        f"Shown: {share}{time.size} of {view.time.size} frames."
-    )
-    return {"content": content, "text": note}

@@ -254,7 +254,7 @@ def open_dataset(path: str | Path) -> xr.Dataset:
         If the store has no checksums, as of dbthermal 0.1.0, so that damage cannot be seen.
     """
     if not texts.as_path(path).is_dir():
-        rule = "Must be a zarr folder, as `save`, a notebook or a command leaves it"
+        rule = "Must be a zarr folder, as from: dbthermal import, or a later step, or `save`"
         raise FileNotFoundError(f"No dataset '{path}'. {rule}.")
     checked = integrity.CheckedStore(path)
     if checked.closed:

@@ -462,11 +462,11 @@ test_what_gives_no_alignment = refused(
 )
 
 
-def test_an_offset_beyond_the_capture_leaves_nothing() -> None:
-    """With an offset beyond the capture all frames of the shifted band count as lost; it warns."""
-    with pytest.warns(UserWarning, match=r"No frame of band 'b0' is left at offsets of \[0\.0, 10"):
-        aligned = align(ramp(), offset=10.0, clock="b1")
-    assert aligned.attrs["frames_lost"] == [40, 0]
+@pytest.mark.parametrize("offset", [10.0, -10.0])
+def test_an_offset_beyond_the_capture_is_refused(offset: float) -> None:
+    """With an offset beyond the capture no frame is left that both bands have."""
+    with pytest.raises(ValueError, match=r"Invalid offset \[0\.0, -?10\.0\] s: it leaves no frame"):
+        align(ramp(), offset=offset, clock="b1")
 
 
 def test_filled_stamps_increase() -> None:

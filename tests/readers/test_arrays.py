@@ -43,7 +43,7 @@ def test_files_of_numpy(tmp_path: Path, order: str, layout: Any) -> None:
         assert_array_equal(found.counts, scene())
         assert found.counts.dtype == np.dtype("uint16")
         assert_allclose(found.time, [0, 0.1, 0.2])
-    with pytest.raises(ValueError, match=r"name of one of the arrays in .* \['dark', 'warm'\]"):
+    with pytest.raises(ValueError, match=r"name of one of the arrays .* in .* \['dark', 'warm'\]"):
         read(tmp_path / "b.npz")
 
 
@@ -67,7 +67,7 @@ def test_a_store_of_our_own_is_no_camera(tmp_path: Path) -> None:
     one = read(scene())
     both = readers.two_bands(one, read(scene() + 1), bands=("8-14", "9.5"), offset=0.0)
     store.save(both, tmp_path / "scene.zarr", store.provenance({}))
-    expected = r"Missing array \(time, y, x\) in 'scene.zarr'.*two bands is a capture as it is"
+    expected = r"Missing array \(time, y, x\) in 'scene.zarr'.*dbthermal is a capture as it is"
     with pytest.raises(ValueError, match=expected):
         read(tmp_path / "scene.zarr")
 

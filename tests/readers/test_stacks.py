@@ -281,7 +281,7 @@ def tagged(code: int, kind: int, value: Any) -> dict[str, Any]:
         (scene().astype("i2"), {}, "Invalid sample format 2 of page 0"),
         (scene().astype("u1"), {}, "Invalid bits of a pixel 8 of page 0"),
         (scene(3), {"photometric": "rgb", "planarconfig": "separate"}, "values of a pixel 3"),
-        (scene(1, (32, 32)), {"tile": (16, 16)}, "Invalid tiled pages"),
+        (scene(1)[0], {"tile": (1024, 1024)}, "Invalid 1 tiles of 1024 x 1024 of page 0. Must"),
         (scene(1)[0], {"subfiletype": 1}, "Invalid preview True of page 0"),
         (scene() // np.uint16(256), {}, "they have 8 bits, alone or spread over two bytes"),
         (scene() // np.uint16(256) * np.uint16(257), {}, "they have 8 bits"),
@@ -319,6 +319,27 @@ def test_refused(tmp_path: Path, counts: Any, options: dict[str, Any], message: 
     """Pictures, temperatures and compressed pages are refused by page and rule."""
     write(path := tmp_path / "a.tif", counts, **options)
     with pytest.raises(ValueError, match=message):
+        read(path)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"byteorder": ">"},
+        {"bigtiff": True, "compression": "lzw"},
+        {"compression": "zlib", "predictor": True},
+        {"ome": True, "metadata": {"axes": "TYX"}},
+    ],
+)
+@pytest.mark.parametrize("tile", [(16, 16), (32, 16), (16, 48), (64, 64)])
+def test_tiles(tmp_path: Path, options: dict[str, Any], tile: tuple[int, int]) -> None:
+    """Tiles, which may reach beyond the image, hold its counts; a page that lost one is refused."""
+    write(path := tmp_path / "a.tif", scene(3, (40, 50)), tile=tile, **options)
+    assert_array_equal(read(path).counts, scene(3, (40, 50)))
+    with tifffile.TiffFile(path, mode="r+") as file:
+        file.pages.first.tags["TileByteCounts"].overwrite(2)
+    with pytest.raises(ValueError, match=r"(Damaged|Truncated|Invalid).* TIFF|strips or tiles"):
         read(path)
 
 

@@ -22,6 +22,7 @@ COLORS = """() => {{
     const data = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;
     return new Set(new Uint32Array(data.buffer)).size;
 }}"""
+WIDTH = "document.querySelector('{part}').getBoundingClientRect().width"
 HOSTILE = "</script><script>document.title = 'taken'</script><img src=x onerror=alert(1)>"
 
 
@@ -206,7 +207,13 @@ def test_page_works_without_a_network(tmp_path: Path) -> None:
             box = page.locator(f"[data-part={part}]").bounding_box()
             assert box is not None
             assert box["x"] + box["width"] <= 390
+        assert page.evaluate(WIDTH.format(part="figure:not(.film) img")) == 600  # which scrolls
         page.emulate_media(media="print")
+        assert page.evaluate(WIDTH.format(part="figure:not(.film) img")) <= 390
+        paper = (".scroll", "overflowX", "visible"), ("pre", "whiteSpace", "pre-wrap")
+        for part, name, value in paper:
+            style = f"getComputedStyle(document.querySelector('{part}')).{name}"
+            assert page.evaluate(style) == value
         assert page.locator(".film img").is_visible()
         assert not page.locator("video").is_visible()
         browser.close()
