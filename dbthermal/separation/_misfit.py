@@ -32,6 +32,7 @@ Whole = npt.NDArray[np.intp]
 
 _BLOCK: Final = 4  # pixels along a side of what is averaged
 _AROUND: Final = 5  # blocks along a side of a neighbourhood
+_LONG: Final = 2**25  # samples of a row of a band, beyond which rows are not read two at a time
 # Deviations of its noise from which a remainder counts; and of single pixels' means, share of their
 # noise. In plain scenes the bars stay as they are.
 _SURE, _ROUGH = 3.0, 0.1
@@ -89,17 +90,15 @@ class _Blocks(NamedTuple):
 
 
 def measure(inputs: Inputs, result: xr.Dataset, workers: int, *probes: Probe) -> Misfit:
-    """Measure how far the signals of pixels without a flag deviate from a separation's model.
-
-    The samples are read for that, and the probes are asked in passing.
-    """
+    """Measure how far unflagged pixels deviate from a model; the probes are asked in passing."""
 
     def examine(rows: slice) -> tuple[_Blocks, list[Any]]:
         reading = reflected(inputs, result, rows)
         sums = [probe(inputs, result, reading) for probe in probes]
         return _of_rows(inputs, result, reading), sums
 
-    with ThreadPoolExecutor(workers) as threads:
+    is_long = inputs.capture["counts"][0, :, 0].size > _LONG
+    with ThreadPoolExecutor(1 if is_long else workers) as threads:
         sections, sums = zip(*threads.map(examine, inputs.blocks), strict=True)
     blocks = _Blocks(*(np.concatenate(maps, axis=-2) for maps in zip(*sections, strict=True)))
     answers = {
