@@ -12,7 +12,7 @@ HOUSE = Path(dbthermal.__file__).parent
 BUDGET = {
     "": (3491, 18),
     "_cli": (1224, 5),
-    "alignment": (2890, 13),
+    "alignment": (2889, 13),
     "calibration": (799, 3),
     "correction": (1754, 7),
     "emissivity": (448, 3),
@@ -26,7 +26,7 @@ BUDGET = {
     "simulation": (570, 3),
     "store": (1410, 6),
 }
-INSTALLED = 36_846  # lines of all rooms
+INSTALLED = 36_845  # lines of all rooms
 
 PRONOUNS = {
     *("one", "other", "others", "own", "part", "parts", "some", "here", "there", "told", "known"),
