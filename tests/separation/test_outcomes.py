@@ -8,9 +8,12 @@ from typing import Final, NamedTuple
 import numpy as np
 import pytest
 import xarray as xr
-from scenes import SHAPE, Shelf, field, held, judged
+from captures import emissivity_of
+from scenes import GLASS, SHAPE, TIME, Shelf, field, held, judged, observed
+from scipy.ndimage import gaussian_filter
+from scipy.signal import lfilter
 
-from dbthermal import separation
+from dbthermal import separation, simulation
 from dbthermal.schema import COMPLETED, Status
 
 
@@ -275,3 +278,38 @@ def test_a_stream_agrees_with_the_whole_capture(shelf: Shelf) -> None:
         for other, lowest in ((scene.truth, least), (batch, 0.95)):
             assert held(one, other, where=good) > lowest, name
     assert float(good.sum() / (batch["status"] == 0).sum()) > 0.95
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_reflections_that_fade_out_are_right(seed: int) -> None:
+    """Where a switched heater is hardly mirrored, what an order hides of the object is no ratio."""
+    rng, shape = np.random.default_rng(seed), (48, 64)
+    middle, period = rng.uniform(0.3, 0.7, 2) * shape, rng.uniform(2.0, 4.0)
+    lit = lfilter([0.25], [1.0, -0.75], np.floor(TIME / period) % 2)
+    away = np.indices(shape) - middle[:, np.newaxis, np.newaxis]
+    cold = 294.0 + 12.0 * np.multiply.outer(lit, np.exp(-0.5 * (away**2).sum(axis=0) / 12.0**2))
+    warmth = gaussian_filter(rng.standard_normal(shape), 9.0)
+    warmth = 7.5 + 7.5 * (warmth - warmth.min()) / np.ptp(warmth)
+    rise = TIME / TIME[-1] + 0.1 * np.sin(2.0 * np.pi * TIME / TIME[-1])
+    warm = 295.5 + np.multiply.outer(rise, warmth)
+    truth = simulation.scene(TIME, warm, cold, emissivity_of(*GLASS))
+    scene = observed(truth, rng, simulation.Rig(noise=(0.03, 0.2)))
+    figures = judged(scene, separation.separate(scene.capture, scene.response))
+    assert figures["measured"] > 0.7
+    assert figures["rmse"] < 0.06  # K
+    assert figures["cover"] >= 0.93
+    assert figures["silent"] == 0.0
+
+
+def test_bands_apart_in_most_pixels_are_told() -> None:
+    """People with sharp outlines, of whom one lens shows less: no shift explains it."""
+    rng = np.random.default_rng(1)
+    truth = simulation.walkers(TIME, SHAPE, emissivity_of(*GLASS), rng)
+    response = simulation.Rig().response()
+    capture = simulation.observe(truth, simulation.Rig(noise=(1e-6, 1e-6)).response(), rng)
+    counts = capture["counts"].values
+    counts[0] = gaussian_filter(counts[0], (0.0, 1.0, 1.0))
+    noise = response["noise"].values[:, np.newaxis, np.newaxis, np.newaxis]
+    counts += noise * rng.standard_normal(counts.shape)
+    with pytest.warns(UserWarning, match="do not show the same"):
+        separation.separate(capture, response)

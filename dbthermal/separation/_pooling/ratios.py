@@ -12,8 +12,6 @@ from dbthermal.separation._subspace import reflection_ratio
 from dbthermal.separation._tiles import Pixels, Survey
 
 _OUTLIER_SIGMAS: Final = 4.0  # deviations beyond which a pixel is not of the material
-# Deviations beyond which the order of the pixels is too small for their material.
-_ORDER_SIGMAS: Final = 3.0
 # Energy along the axis from which there is one: deviations of the noise's, and share of it [1].
 _ENERGY_SIGMAS: Final = 8.0
 _LEAST_ENERGY: Final = 0.01
@@ -71,18 +69,24 @@ class Ratios:
 def estimate(
     labels: Labels, count: int, survey: Survey, noise: Array, *, even: bool = False
 ) -> Ratios:
-    """Ratios of the summed scatters, at the order of each pixel unless the largest contradicts it.
+    """Ratios of the summed scatters at the largest order, or where it tells none, of each pixel.
 
-    Then at that; and what fewer functions would change, beyond noise, is a variance. With `even`
-    weights few pixels of much energy do not turn the axis: they are to be found as outliers.
+    What fewer functions would change, beyond noise, is a variance; and at the orders of the pixels,
+    what these leave of the object. With `even` weights few pixels of much energy do not turn the
+    axis: they are to be found as outliers.
     """
     scatters = [*zip(survey.scatter, survey.frames, strict=True)]
     if even:
         scatters = [_even(labels, count, *scatter) for scatter in scatters]
     at_order, fewer, most = (_at_order(labels, count, *scatter, noise) for scatter in scatters)
-    rapid = _apart(at_order, most, noise)[0] > _ORDER_SIGMAS
+    rapid = np.isfinite(most[1])
     ratio, variance = (np.where(rapid, *pair) for pair in zip(most, at_order, strict=True))
-    return Ratios(ratio, variance + np.where(rapid, _apart(fewer, most, noise)[1], 0.0), rapid)
+    # An object's curve that hides in noise, of an energy A = s^2 / (k - 1)^2, turns the ratio by
+    # (k - 1) A / E beside a reflection of energy E, s the deviation of the null combination.
+    error = noise[1:, np.newaxis] ** 2 + (ratio[1:] * noise[0]) ** 2
+    pixels = total(labels, 1.0 * (survey.frames[0] > 0), count)
+    hidden = (pixels * variance) ** 2 * np.max(error / (ratio[1:] - 1.0) ** 2, axis=0)
+    return Ratios(ratio, variance + np.where(rapid, _excess(fewer, most, error), hidden), rapid)
 
 
 def _even(labels: Labels, count: int, scatter: Array, frames: Array) -> tuple[Array, Array]:
@@ -116,18 +120,14 @@ def _at_order(
     return np.where(informed, ratio, np.nan), np.where(informed, variance, np.nan)
 
 
-def _apart(
-    smaller: tuple[Array, Array], larger: tuple[Array, Array], noise: Array
-) -> tuple[Array, Array]:
-    """Difference of the ratios at two orders in standard deviations, and its excess [1/K^2].
+def _excess(smaller: tuple[Array, Array], larger: tuple[Array, Array], error: Array) -> Array:
+    """Square of the difference of ratios at two orders beyond chance [1/K^2], over their error.
 
     The estimate at the smaller order is the more certain one, and their difference has the
     difference of their variances (Hausman 1978, doi:10.2307/1913827).
     """
-    scale = noise[1:, np.newaxis] ** 2 + (larger[0][1:] * noise[0]) ** 2
-    square = np.max((smaller[0] - larger[0])[1:] ** 2 / scale, axis=0)
-    expected = np.abs(larger[1] - smaller[1])
-    return np.sqrt(square / expected), np.maximum(square - expected, 0.0)
+    square = np.max((smaller[0] - larger[0])[1:] ** 2 / error, axis=0)
+    return np.asarray(np.maximum(square - np.abs(larger[1] - smaller[1]), 0.0))
 
 
 def outliers(
