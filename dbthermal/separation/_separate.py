@@ -302,9 +302,10 @@ def _separated(
         inputs = replace(inputs, displacement=shift)
     # Separate each pixel.
     alone, surveys = separated(inputs, workers=workers, progress=progress)
-    asynchronous = Measured(alone, inputs, None, reflection_shift, []).asynchronous
-    share = max(share, asynchronous) if asynchronous > _MANY else share
-    doubts = [_UNEXPLAINED.format(share)] if share > 0.0 else []
+    if reflection_shift is not None:
+        share = Measured(alone, inputs, None, reflection_shift, []).asynchronous
+    unexplained = share > (0.0 if reflection_shift is None else _MANY)
+    doubts = [_UNEXPLAINED.format(share)] if unexplained else []
     # Pool the pixels of each material, and hold them to what each tells by itself.
     result = alone
     pool = partial(separated, alone=alone, surveys=surveys, workers=workers, progress=progress)

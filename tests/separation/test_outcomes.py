@@ -299,17 +299,3 @@ def test_reflections_that_fade_out_are_right(seed: int) -> None:
     assert figures["rmse"] < 0.06  # K
     assert figures["cover"] >= 0.93
     assert figures["silent"] == 0.0
-
-
-def test_bands_apart_in_most_pixels_are_told() -> None:
-    """People with sharp outlines, of whom one lens shows less: no shift explains it."""
-    rng = np.random.default_rng(1)
-    truth = simulation.walkers(TIME, SHAPE, emissivity_of(*GLASS), rng)
-    response = simulation.Rig().response()
-    capture = simulation.observe(truth, simulation.Rig(noise=(1e-6, 1e-6)).response(), rng)
-    counts = capture["counts"].values
-    counts[0] = gaussian_filter(counts[0], (0.0, 1.0, 1.0))
-    noise = response["noise"].values[:, np.newaxis, np.newaxis, np.newaxis]
-    counts += noise * rng.standard_normal(counts.shape)
-    with pytest.warns(UserWarning, match="do not show the same"):
-        separation.separate(capture, response)
