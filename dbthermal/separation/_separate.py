@@ -11,7 +11,7 @@ from warnings import catch_warnings
 import numpy as np
 import xarray as xr
 
-from dbthermal import _numbers, alignment, schema
+from dbthermal import _numbers, _samples, alignment, schema
 from dbthermal._arrays import Array
 from dbthermal._warnings import warned
 from dbthermal.alignment._planes import Scale, share_displaced
@@ -33,6 +33,7 @@ from dbthermal.separation._motion import drift, stabilise
 from dbthermal.separation._overlay import overlay
 from dbthermal.separation._pooling import materials as pooling
 from dbthermal.separation._pooling.pool import hold
+from dbthermal.separation._quality import MOST_BRIDGED
 from dbthermal.separation._reflection import as_gray, restored
 from dbthermal.separation._solve import get_method, require_workers, separated
 from dbthermal.separation._tiles import Material
@@ -205,7 +206,7 @@ def _on_one_clock(
     except ValueError:  # nothing tells the clocks: the pixels keep the flag
         return unchanged
     times, aligned = aligned["time"], aligned.assign_coords(time=capture["time"])
-    retry = once(aligned)
+    retry = unchanged[1] if _lacking(aligned) else once(aligned)
     if not retry[0].asynchronous < _LESS * share:
         return unchanged
     offsets, std = np.array(aligned.attrs["time_offset"]), aligned.attrs.get("time_offset_std")
@@ -214,7 +215,10 @@ def _on_one_clock(
     if np.any(aligned["noise_factor"] < schema.noise_factor(capture)):
         # Between frames the rapid changes of the band that is interpolated are too small.
         offset = xr.DataArray(offsets, {"band": names}, "band")
-        second = once(alignment.align(capture, offset=offset, clock=names[place]))[0].result
+        exchanged = alignment.align(capture, offset=offset, clock=names[place])
+        if _lacking(exchanged):
+            return unchanged
+        second = once(exchanged)[0].result
         films = [result["object_temperature"] for result in (retry[0].result, second)]
         change = films[1].interp(time=times) - films[0].values
         detail = np.nan_to_num(0.5 * np.sqrt((change**2).mean("time").values))
@@ -222,6 +226,12 @@ def _on_one_clock(
     sentence = f"The clocks differ: band '{names[place]}' was taken {offsets[place]:+.4f} s after "
     sentence += f"'{names[0]}'{known}, and was interpolated."
     return aligned, retry, [*(str(note.message) for note in notes), sentence], detail
+
+
+def _lacking(aligned: xr.Dataset) -> bool:
+    """Say that a band lacks more samples than can be bridged: at steps none is interpolated."""
+    lost = ~schema.measured(_samples.some_pixels(aligned["counts"]))
+    return bool(lost.mean(axis=(1, 2)).max() > MOST_BRIDGED)
 
 
 def _mended(

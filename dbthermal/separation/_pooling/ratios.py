@@ -12,6 +12,7 @@ from dbthermal.separation._subspace import reflection_ratio
 from dbthermal.separation._tiles import Pixels, Survey
 
 _OUTLIER_SIGMAS: Final = 4.0  # deviations beyond which a pixel is not of the material
+_ORDER_SIGMAS: Final = 3.0  # the same for a ratio of fewer functions
 # Energy along the axis from which there is one: deviations of the noise's, and share of it [1].
 _ENERGY_SIGMAS: Final = 8.0
 _LEAST_ENERGY: Final = 0.01
@@ -69,24 +70,28 @@ class Ratios:
 def estimate(
     labels: Labels, count: int, survey: Survey, noise: Array, *, even: bool = False
 ) -> Ratios:
-    """Ratios of the summed scatters at the largest order, or where it tells none, of each pixel.
+    """Ratios of the summed scatters at the order of each pixel, or the largest if that hides any.
 
-    What fewer functions would change, beyond noise, is a variance; and at the orders of the pixels,
-    what these leave of the object. With `even` weights few pixels of much energy do not turn the
-    axis: they are to be found as outliers.
+    What fewer functions than those would change, beyond noise, is a variance; and where the largest
+    order tells nothing, what the pixels' orders may hide. With `even` weights few pixels of much
+    energy do not turn the axis: they are to be found as outliers.
     """
     scatters = [*zip(survey.scatter, survey.frames, strict=True)]
     if even:
         scatters = [_even(labels, count, *scatter) for scatter in scatters]
     at_order, fewer, most = (_at_order(labels, count, *scatter, noise) for scatter in scatters)
-    rapid = np.isfinite(most[1])
-    ratio, variance = (np.where(rapid, *pair) for pair in zip(most, at_order, strict=True))
     # An object's curve that hides in noise, of an energy A = s^2 / (k - 1)^2, turns the ratio by
     # (k - 1) A / E beside a reflection of energy E, s the deviation of the null combination.
+    known = np.isfinite(most[1])
+    ratio, variance = (np.where(known, *pair) for pair in zip(most, at_order, strict=True))
     error = noise[1:, np.newaxis] ** 2 + (ratio[1:] * noise[0]) ** 2
     pixels = total(labels, 1.0 * (survey.frames[0] > 0), count)
     hidden = (pixels * variance) ** 2 * np.max(error / (ratio[1:] - 1.0) ** 2, axis=0)
-    return Ratios(ratio, variance + np.where(rapid, _excess(fewer, most, error), hidden), rapid)
+    rapid = _excess(at_order, most, error) > 0.0
+    rapid |= known & ~(hidden < _OUTLIER_SIGMAS**2 * variance)
+    ratio, variance = (np.where(rapid, *pair) for pair in zip(most, at_order, strict=True))
+    excess = np.where(rapid, _excess(fewer, most, error), 0.0)
+    return Ratios(ratio, variance + np.where(known, excess, hidden), rapid)
 
 
 def _even(labels: Labels, count: int, scatter: Array, frames: Array) -> tuple[Array, Array]:
@@ -127,7 +132,8 @@ def _excess(smaller: tuple[Array, Array], larger: tuple[Array, Array], error: Ar
     difference of their variances (Hausman 1978, doi:10.2307/1913827).
     """
     square = np.max((smaller[0] - larger[0])[1:] ** 2 / error, axis=0)
-    return np.asarray(np.maximum(square - np.abs(larger[1] - smaller[1]), 0.0))
+    expected = np.abs(larger[1] - smaller[1])
+    return np.where(square > _ORDER_SIGMAS**2 * expected, square - expected, 0.0)
 
 
 def outliers(
