@@ -15,6 +15,7 @@ axes, this tells the rapid changes of the object, which lie along another line, 
 background: of two lines that explain the data the object's is the one with fewer pieces.
 """
 
+from collections.abc import Iterator
 from functools import lru_cache
 from math import acos, sqrt
 from typing import NamedTuple
@@ -137,7 +138,10 @@ def _tree(times: bytes, events: bytes | None) -> Tree:
         edges[1:-1][edges[1:-1] == place] += 1
     bounds = [edges[:: 2 ** (levels - level)] for level in range(levels + 1)]
     spans = np.concatenate([np.stack([bound[:-1], bound[1:]], 1) for bound in bounds])
-    every = [_functions(time[start:stop], segment[start:stop]) for start, stop in spans]
+    if event.any():
+        every = [_functions(time[start:stop], segment[start:stop]) for start, stop in spans]
+    else:
+        every = [functions for bound in bounds for functions in _of_level(time, bound)]
     bases = [basis for basis, _ in every]
     values = [_values(bases, i) for i in range(len(bases))]
     sizes, columns = (np.array([*map(len, rows)]) for rows in (values, [b.T for b in bases]))
@@ -153,6 +157,18 @@ def _tree(times: bytes, events: bytes | None) -> Tree:
         time=time,
         event=event,
     )
+
+
+def _of_level(time: Array, edges: Whole) -> Iterator[tuple[Array, int]]:
+    """Yield the `_functions` of pieces without a shutter event, between edges; quicker together."""
+    first = np.isin(np.arange(time.size), edges)
+    columns, start = smooth.piecewise(time, first, np.empty((time.size, 0))).functions, 0
+    for piece in map(slice, edges[:-1], edges[1:]):
+        length = piece.stop - piece.start
+        order = min(smooth.PIECE_ORDER, length)
+        basis = np.ascontiguousarray(columns[piece, start : start + order])
+        yield basis, pieces.FUNCTIONS if length > smooth.PIECE_ORDER else order
+        start += order
 
 
 def _functions(time: Array, segment: Whole) -> tuple[Array, int]:
