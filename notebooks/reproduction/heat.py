@@ -8,7 +8,7 @@ a flux a - b T - s T^4 into the shell, so any number of them add up to three num
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, Final, TypeAlias
 
@@ -21,6 +21,7 @@ from scipy.constants import Stefan_Boltzmann
 from scipy.sparse.linalg import splu
 
 from dbthermal._arrays import Array
+from dbthermal.planck import require_positive
 
 Varying: TypeAlias = float | Array | Callable[[float], float | Array]
 """A number, one for each vertex (vertex,), or a function of time [s] that returns either."""
@@ -37,10 +38,11 @@ class Convection:
     coefficient: Varying
     temperature: Varying
 
-    def terms(self, time: float) -> tuple[Array | float, ...]:
-        """Terms a, b, s of `Balance` at a time [s]."""
-        coefficient = _evaluate(self.coefficient, time)
-        return coefficient * _evaluate(self.temperature, time), coefficient, 0.0
+    def terms(self, time: float, vertices: int) -> tuple[Array | float, ...]:
+        """Terms a, b, s of `Balance` at a time [s]; ValueError for what is not physical."""
+        coefficient = _evaluate("coefficient of convection", self.coefficient, time, vertices, 0.0)
+        fluid = _evaluate("temperature of convection", self.temperature, time, vertices, 0.0)
+        return coefficient * fluid, coefficient, 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,10 +55,12 @@ class Radiation:
     emissivity: Varying
     temperature: Varying
 
-    def terms(self, time: float) -> tuple[Array | float, ...]:
+    def terms(self, time: float, vertices: int) -> tuple[Array | float, ...]:
         """Terms a, b, s of `Balance`, see `Convection.terms`."""
-        quartic = Stefan_Boltzmann * _evaluate(self.emissivity, time)
-        return quartic * _evaluate(self.temperature, time) ** 4, 0.0, quartic
+        emissivity = _evaluate("emissivity of radiation", self.emissivity, time, vertices, 0.0, 1.0)
+        radiant = _evaluate("temperature of radiation", self.temperature, time, vertices, 0.0)
+        quartic = Stefan_Boltzmann * emissivity
+        return quartic * radiant**4, 0.0, quartic
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,9 +69,9 @@ class Heating:
 
     flux: Varying
 
-    def terms(self, time: float) -> tuple[Array | float, ...]:
+    def terms(self, time: float, vertices: int) -> tuple[Array | float, ...]:
         """Terms a, b, s of `Balance`, see `Convection.terms`."""
-        return _evaluate(self.flux, time), 0.0, 0.0
+        return _evaluate("flux of heating", self.flux, time, vertices), 0.0, 0.0
 
 
 Exchange: TypeAlias = Convection | Radiation | Heating
@@ -82,7 +86,7 @@ class Balance:
     def __init__(self, exchanges: Sequence[Exchange], time: float, vertices: int) -> None:
         total = np.zeros((3, vertices))
         for exchange in exchanges:
-            for place, term in enumerate(exchange.terms(time)):
+            for place, term in enumerate(exchange.terms(time, vertices)):
                 total[place] += term
         self.constant, self.linear, self.quartic = total
 
@@ -95,9 +99,28 @@ class Balance:
         return self.linear + 4.0 * self.quartic * temperature**3
 
 
-def _evaluate(value: Varying, time: float) -> float | Array:
-    """Varying quantity at a time [s], a number or one for each vertex."""
-    return value(time) if callable(value) else value
+def _evaluate(
+    name: str,
+    value: Varying,
+    time: float,
+    vertices: int,
+    lowest: float = -np.inf,
+    highest: float = np.inf,
+) -> Array:
+    """Varying quantity at a time [s] and every vertex (vertex,), finite and within limits."""
+    array = np.asarray(value(time) if callable(value) else value, dtype=np.float64)
+    if array.shape not in {(), (vertices,)}:
+        rule = f"Must be a number or ({vertices},)"
+        raise ValueError(f"Invalid shape {array.shape} of the {name} at {time:g} s. {rule}.")
+    bad = ~(np.isfinite(array) & (array >= lowest) & (array <= highest))
+    if np.any(bad):
+        rule = f"be finite, and lie in [{lowest:g}, {highest:g}]"
+        raise ValueError(f"Invalid {name} {array[bad].flat[0]} at {time:g} s. Must {rule}.")
+    return np.broadcast_to(array, (vertices,))
+
+
+_FLATTEST: Final = 1e-9
+"""A face that is flatter than this fraction of the mesh's size has no area [1]."""
 
 
 @dataclass(frozen=True)
@@ -107,6 +130,11 @@ class Solid:
     conductivity: float  # k [W m^-1 K^-1]
     density: float  # [kg m^-3]
     specific_heat: float  # at constant pressure, c [J kg^-1 K^-1]
+
+    def __post_init__(self) -> None:
+        """Refuse a property that is not finite and positive."""
+        for field in fields(self):
+            require_positive(f"{field.name} of a solid", getattr(self, field.name))
 
 
 # At 300 K, from table A.3 of Bergman, Lavine, Incropera, DeWitt (2011), Fundamentals of Heat and
@@ -131,13 +159,29 @@ class Shell:
     series with the fluid, :math:`1 / (1/h + d / 2k)`, and the outer face still lags by some
     :math:`d^2 / 2 \alpha` (6 s).
 
-    Every vertex belongs to a face, and every face has an area and is there once. The sense of the
-    faces does not matter; edges may be open (insulated) or shared by more than two faces.
+    ValueError if a number is not finite, a vertex belongs to no face, or a face is repeated or has
+    no area. The sense of the faces does not matter; edges may be open (insulated) or shared by more
+    than two faces.
     """
 
     mesh: trimesh.Trimesh  # [m]
     thickness: float  # d [m]
     solid: Solid
+
+    def __post_init__(self) -> None:
+        """Check thickness and mesh."""
+        require_positive("thickness [m] of a shell", self.thickness)
+        mesh = self.mesh
+        if mesh.is_empty:
+            raise ValueError("Empty mesh of a shell. Must have a face.")
+        for what, holds in (
+            ("vertex {} that is not finite", np.isfinite(mesh.vertices).all(axis=1)),
+            ("vertex {} of no face", mesh.referenced_vertices),
+            ("face {} without an area", mesh.nondegenerate_faces(_FLATTEST * mesh.scale)),
+            ("face {}, as an earlier one", mesh.unique_faces()),
+        ):
+            for number in np.flatnonzero(~np.asarray(holds)):
+                raise ValueError(f"Invalid {what.format(number)}. Must be left out.")
 
     @cached_property
     def _operators(self) -> tuple[Any, Array]:
@@ -210,7 +254,8 @@ def simulate(
     interval of the times is cut evenly into as few steps as the longest `step` [s] allows, one by
     default. `tolerance` is the largest error of the iteration in a stage [K].
 
-    ArithmeticError if a temperature falls to 0 K or below, or a stage does not converge.
+    ValueError if a parameter has the wrong shape or is not physical, or an exchange at some time is
+    not. ArithmeticError if a temperature falls to 0 K or below, or a stage does not converge.
 
     References
     ----------
@@ -232,11 +277,11 @@ def simulate(
     >>> (temperature[-1] - 293.15).round(2).tolist()
     [3.68, 3.68, 3.68, 3.68]
     """
-    times = np.asarray(time, dtype=np.float64)
-    limit = np.inf if step is None else step
-    temperature = np.full(len(shell.area), initial, dtype=np.float64)
+    times = _times(time)
+    limit = np.inf if step is None else float(require_positive("step [s]", step))
+    temperature = _initial(initial, len(shell.area))
     stepper = _Stepper(shell, exchanges, temperature, times[0])
-    stepper.tolerance = tolerance
+    stepper.tolerance = float(require_positive("tolerance [K]", tolerance))
     result = np.empty((times.size, temperature.size))
     result[0] = temperature
     for index in range(1, times.size):
@@ -331,3 +376,23 @@ class _Stepper:
         """Bound of the factor by which an iteration shrinks the error [1]."""
         inertia = self.shell.capacity_per_area / self.weight
         return float(np.max(np.abs(slope - self.slope) / (inertia + self.slope)))
+
+
+def _times(time: npt.ArrayLike) -> Array:
+    """Return times that are finite and increase, or raise a ValueError."""
+    times = np.asarray(time, dtype=np.float64)
+    if times.ndim != 1 or not times.size or not np.all(np.isfinite(times)):
+        raise ValueError(f"Invalid times of shape {times.shape}. Must be finite, one at least.")
+    for index in np.flatnonzero(np.diff(times) <= 0):
+        raise ValueError(f"Invalid time {times[index + 1]} s. Must be above the one before.")
+    return times
+
+
+def _initial(initial: npt.ArrayLike, vertices: int) -> Array:
+    """Return a copy of an initial temperature for every vertex, or raise a ValueError."""
+    array = np.asarray(initial, dtype=np.float64)
+    if array.shape not in {(), (vertices,)}:
+        label = f"Invalid shape {array.shape} of the initial temperature"
+        raise ValueError(f"{label}. Must be a number or ({vertices},).")
+    require_positive("initial temperature", array)
+    return np.array(np.broadcast_to(array, (vertices,)))

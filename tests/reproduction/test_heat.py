@@ -5,6 +5,7 @@ CJ is Carslaw, Jaeger (1959), Conduction of Heat in Solids, 2nd edition, Oxford.
 
 import itertools
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -201,25 +202,52 @@ def test_unevenly_spaced_times() -> None:
     assert (min(called), max(called)) == (0.0, 100.0)
 
 
+TRIANGLE, FACE = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), [[0, 1, 2]]
+
+
+def bent(vertices: Array, faces: Any, thickness: float = 1e-3) -> Callable[[], object]:
+    """Shell of some vertices and faces."""
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    return lambda: heat.Shell(mesh, thickness, heat.GLASS)
+
+
+def exchanging(term: heat.Exchange) -> Callable[[], object]:
+    """One second of an exchange."""
+    return lambda: spot([0.0, 1.0], AMBIENT, [term])
+
+
 @pytest.mark.parametrize(
-    ("term", "message"),
+    ("call", "message"),
     [
-        # A cooled spot is refused below 0 K, with no negative temperature on the way.
-        (heat.Heating(-100.0), "Invalid temperature -.* Must be above 0 K"),
-        (heat.Heating(np.nan), "No convergence at .* s: nan K after"),
+        (bent(TRIANGLE * np.nan, FACE), "Invalid vertex 0 that is not fin"),
+        (bent(TRIANGLE, [[0, 1, 1]]), "Invalid vertex 2 of no face"),
+        (bent(TRIANGLE * (1.0, 0.0, 0.0), FACE), "Invalid face 0 without an area"),
+        (bent(TRIANGLE, [[0, 1, 2], [2, 1, 0]]), "Invalid face 1, as an earlier one"),
+        (bent(TRIANGLE, FACE, 0.0), r"Invalid thickness \[m\] of a shell 0.0"),
+        (exchanging(heat.Convection(-1.0, 300.0)), "coefficient of convection -1.0 at 0 s"),
+        (exchanging(heat.Convection(1.0, np.ones(2))), r"Invalid shape \(2,\) of the temperature"),
+        (exchanging(heat.Convection(lambda t: 1.0 / (t < 0.1) - 1.0, 300.0)), "coefficient .* inf"),
+        (exchanging(heat.Radiation(1.2, 300.0)), r"emissivity of radiation 1.2.* in \[0, 1\]"),
+        (exchanging(heat.Radiation(0.9, lambda t: 300.0 - 4e3 * t)), "temperature of radiation -"),
+        (exchanging(heat.Heating(np.nan)), "Invalid flux of heating nan"),
+        (lambda: heat.Solid(1.0, -1.0, 1.0), r"Invalid density of a solid -1\.0"),
+        (lambda: spot([0.0, 0.0], 300.0, []), "Invalid time 0.0 s"),
+        (lambda: spot([], 300.0, []), r"Invalid times of shape \(0,\)"),
+        (lambda: spot([0.0], -1.0, []), "Invalid initial temperature -1.0"),
+        (lambda: heat.simulate(shell(SPOT), [0.0], [1.0]), r"Invalid shape \(1,\) of the initial"),
+        (lambda: spot([0.0], 300.0, [], step=0.0), r"Invalid step \[s\] 0.0"),
         (
-            heat.Convection(lambda t: 1.0 if t < 5e4 else np.nan, 300.0),
-            "No convergence at .* s: nan K after",
+            lambda: spot([0.0, 1e5], AMBIENT, [heat.Heating(-100.0)], step=10.0),
+            r"Invalid temperature -.* Must be above 0 K",  # and no negative temperature
+        ),
+        (
+            lambda: spot([0.0, 100.0], 500.0, [heat.Radiation(0.9, AMBIENT)], tolerance=1e-30),
+            r"No convergence at 29\.\d+ s: .* Must be below 1e-",
         ),
     ],
 )
-def test_what_is_not_physical(term: heat.Exchange, message: str) -> None:
-    """A temperature below 0 K and a flux that is not finite are errors, never a result."""
-    with pytest.raises(ArithmeticError, match=message):
-        spot([0.0, 1e5], AMBIENT, [term], step=10.0)
-
-
-def test_no_convergence() -> None:
-    """A tolerance that cannot be reached is an error with the way out."""
-    with pytest.raises(ArithmeticError, match=r"No convergence at 29\.\d+ s: .* Must be below 1e-"):
-        spot([0.0, 100.0], 500.0, [heat.Radiation(0.9, AMBIENT)], tolerance=1e-30)
+@pytest.mark.filterwarnings("ignore:divide by zero")
+def test_what_is_not_physical(call: Callable[[], object], message: str) -> None:
+    """Invalid meshes, exchanges, solids, times, steps, temperatures and ends are errors."""
+    with pytest.raises((ValueError, ArithmeticError), match=message):
+        call()

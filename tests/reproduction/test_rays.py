@@ -47,8 +47,19 @@ def test_field_of_view_is_horizontal() -> None:
     np.testing.assert_allclose(FRONT.axes, expected, rtol=0, atol=1e-15)
 
 
-def test_nothing_is_seen_behind_the_camera() -> None:
-    """A point behind the camera has no place in its image."""
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"field_of_view": 180.0}, r"field_of_view 180.0 degrees. Must lie in \(0, 180\)"),
+        ({"shape": (0, 4)}, "shape .* Must be positive"),
+        ({"target": (0.1, -0.6, 0.0)}, "target .* Must not be straight above"),
+    ],
+)
+def test_no_camera(change: dict[str, object], message: str) -> None:
+    """Invalid settings of a camera raise a ValueError with the rule; behind it nothing is seen."""
+    arguments = {"position": CAMERA.position, "target": CAMERA.target, "shape": (3, 4)} | change
+    with pytest.raises(ValueError, match=message):
+        Camera(**arguments)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="Must be positive"):
         FRONT.project([0.0, -2.0, 0.0])
 

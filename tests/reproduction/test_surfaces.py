@@ -100,6 +100,14 @@ def test_capsule_lies_between_its_ends(end: tuple[float, float, float]) -> None:
     np.testing.assert_allclose(distance, 0.02, rtol=0, atol=2e-6)
 
 
+def test_wrong_sizes() -> None:
+    """A size that is not positive raises an error."""
+    with pytest.raises(ValueError, match=r"Invalid length and spacing .m. 0.0"):
+        surfaces.plate(0.0, 0.1, 0.01)
+    with pytest.raises(ValueError, match=r"Invalid .* spacing .m. nan"):
+        surfaces.ellipsoid((1, 1, 1), (0, 0, 0), np.nan)
+
+
 def test_rabbit_sits_on_the_table() -> None:
     """The built-in rabbit is of six closed parts, as high as the bunny."""
     rabbit = bodies.rabbit()

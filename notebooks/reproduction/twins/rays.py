@@ -34,13 +34,25 @@ class Camera:
     """A pinhole camera with square pixels.
 
     At a position, with a target at the middle of its view [m], of a shape (rows, columns) and a
-    horizontal field of view [degrees], 24 in the paper; its target is not straight above or below.
+    horizontal field of view [degrees]; 24 in the paper.
     """
 
     position: Point
     target: Point
     shape: tuple[int, int]
     field_of_view: float = 24.0
+
+    def __post_init__(self) -> None:
+        """Check field of view, shape and direction."""
+        if not 0 < self.field_of_view < 180:
+            rule = "Must lie in (0, 180)"
+            raise ValueError(f"Invalid field_of_view {self.field_of_view} degrees. {rule}.")
+        if min(self.shape) < 1:
+            raise ValueError(f"Invalid shape {self.shape} of the camera. Must be positive.")
+        right = np.cross(np.subtract(self.target, self.position), _UP)
+        if not np.linalg.norm(right) > 0:
+            message = f"Invalid target {self.target} of the camera at {self.position}"
+            raise ValueError(f"{message}. Must not be straight above or below.")
 
     @cached_property
     def axes(self) -> Array:
