@@ -262,8 +262,10 @@ def _described(paths: list[Path], options: argparse.Namespace, camera: int) -> d
 def _is_store(path: Path) -> bool:
     """Tell whether a folder is a store of dbthermal or a part of one, not one of other programs."""
     group, member = path.parent / "zarr.json", path / "zarr.json"
-    if (path / integrity.SUMS).is_file() or not member.is_file():
-        return (path / integrity.SUMS).is_file()
+    if (path / integrity.SUMS).is_file():
+        return True
+    if not member.is_file():
+        return False
     text = (group if group.is_file() else member).read_text(encoding="utf-8", errors="replace")
     return "provenance" in text or "frames_written" in text or '"attributes"' not in text
 

@@ -324,7 +324,7 @@ def _separate(
     size, options = 0, [] if inputs.settings is None else [inputs.settings]
     for cut in tiles.cut(inputs, rows, material, wanted):
         estimates = []
-        for frames, pixels, tile in cut.parts:
+        for frames, pixels, tile in cut.sections:
             estimate: Estimate = inputs.method.separate(tile, *options)
             if estimate.status.size == pixels.size and not pixels.all():
                 estimate = estimate.select_pixels(pixels)

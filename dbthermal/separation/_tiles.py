@@ -29,7 +29,7 @@ Whole = npt.NDArray[np.intp]
 Mask = npt.NDArray[np.bool_]
 Window = tuple[slice, slice]
 """Rows and columns of a tile in the image."""
-Part = tuple[Window, Whole, slice, slice | Whole]
+Patch = tuple[Window, Whole, slice, slice | Whole]
 """A window, and its pixels: numbers in the image, places among those read, and in the window."""
 
 KEPT_ATTRS: Final = ("origin", "radiometric", "source", "twin")
@@ -249,7 +249,7 @@ class Cut:
     places: Whole  # numbers of the pixels in the image (pixel)
     status: Bits  # (pixel)
     valid: Mask  # samples of the capture (time, pixel)
-    parts: list[Section]
+    sections: list[Section]
 
 
 def windows(rows: slice, columns: slice, pixels: int) -> Iterator[Window]:
@@ -283,12 +283,12 @@ def cut(
     size = most if displacement is None else max(width, _TOGETHER // frames)
     size = (rows.stop - rows.start) * width if method.whole_image else size
     for window in windows(rows, slice(0, width), size):
-        selected, parts = _parts(window, width, most if method.compiled else size, wanted)
-        if not parts:
+        selected, patches = _patches(window, width, most if method.compiled else size, wanted)
+        if not patches:
             continue
         # Read the pixels together; judge the samples, and group the pixels by valid frames.
         counts, usable, valid, status, gain = sampled(window, selected)
-        for part, places, within, chosen in parts:
+        for patch, places, within, chosen in patches:
             # A tile's own samples lie together: rows of a large film are far apart in memory.
             signals = np.ascontiguousarray(counts[..., within])
             bridged, flags = np.ascontiguousarray(usable[:, within]), status[within]
@@ -299,7 +299,7 @@ def cut(
             packed = inputs.division[:, places]
             division = np.unpackbits(packed, axis=0, count=frames).view(bool)
             tile = replace(
-                _tile(inputs, signals, part, chosen),
+                _tile(inputs, signals, patch, chosen),
                 surveyed=displacement is None or wanted is not None,
                 gain=gain[1, within] if displacement is not None and method.compiled else None,
                 division=division if packed.any() else None,
@@ -316,20 +316,20 @@ def cut(
                     sections.append((used, pixels, section))
                 else:
                     sections.extend(of_one_noise(used, pixels, section, gain[1], most))
-            yield Cut(part, places, flags, valid[:, within], sections)
+            yield Cut(patch, places, flags, valid[:, within], sections)
 
 
-def _parts(
+def _patches(
     window: Window, width: int, pixels: int, wanted: Mask | None
-) -> tuple[slice | Whole, list[Part]]:
-    """Pixels of a window that are wanted, and parts of at most so many of them."""
+) -> tuple[slice | Whole, list[Patch]]:
+    """Pixels of a window that are wanted, and patches of at most so many of them."""
     if wanted is None:
-        parts, start = list[Part](), 0
-        for part in windows(*window, pixels):
-            places = _numbers(part, width)
-            parts.append((part, places, slice(start, start + places.size), slice(None)))
+        patches, start = list[Patch](), 0
+        for patch in windows(*window, pixels):
+            places = _numbers(patch, width)
+            patches.append((patch, places, slice(start, start + places.size), slice(None)))
             start += places.size
-        return slice(None), parts
+        return slice(None), patches
     places = _numbers(window, width)
     selected = np.flatnonzero(wanted[places])
     spans = [slice(start, start + pixels) for start in range(0, selected.size, pixels)]

@@ -189,22 +189,21 @@ def paired(
     """
     films, every = displacement.read, (rows.start, rows.stop, b"")
     chosen = every if isinstance(selected, slice) else (*every[:2], selected.tobytes())
+    reading = films.get(chosen, films.get(every))
+    if reading is None:
+        block, grains = load()
+        counts, valid, status, gain = read(block, displacement, rows, source, fewest, grains)
+        counts, usable = quality.bridge(counts, valid, block["time"].values.astype(np.float64))
+        reading = counts.astype(np.float32), usable, valid, status, gain
     if chosen not in films:
-        reading = films.get(every)
-        if reading is None:
-            block, grains = load()
-            counts, valid, status, gain = read(block, displacement, rows, source, fewest, grains)
-            counts, usable = quality.bridge(counts, valid, block["time"].values.astype(np.float64))
-            reading = counts.astype(np.float32), usable, valid, status, gain
         share = (rows.stop - rows.start) / displacement.shape[0]
         if chosen != every:
             share, reading = 1.0, tuple(select(film, selected) for film in reading)
         groups = reading, chain(*films.values())
         size, held = (sum(film.nbytes for film in group) for group in groups)
-        if size + held > _KEPT or (share < 1.0 and size > 0.5 * share * _KEPT):
-            films = {chosen: reading}
-        films[chosen] = reading
-    counts, usable, valid, status, gain = films[chosen]  # the tile is made of them, in place
+        if size + held <= _KEPT and (share == 1.0 or size <= 0.5 * share * _KEPT):
+            films[chosen] = reading
+    counts, usable, valid, status, gain = reading  # the tile is made of them, in place
     return counts.astype(np.float64), usable, valid, status.copy(), gain
 
 

@@ -117,12 +117,8 @@ class Joint:
     factor: Callable[[], Floats]  # variance of the object over that of a pixel alone (pixel) [1]
     unsettled: Mask  # the iteration did not come to an end (pixel)
 
-    def difference(self, pixels: Whole) -> Floats:
-        """Signals (band - 1, time, pixel) [K] of x(p) over x(r), of some pixels; 0 unknown."""
-        return self.at(slice(None), pixels)
-
-    def at(self, frames: slice | Whole, pixels: Whole) -> Floats:
-        """Signals (band - 1, frame, pixel) [K] of x(p) over x(r); 0 unknown."""
+    def difference(self, pixels: Whole, frames: slice | Whole = slice(None)) -> Floats:
+        """Signals (band - 1, frame, pixel) [K] of x(p) over x(r), of some pixels; 0 unknown."""
         weights = self.frames.weights
         # Of a rapid film the frames that are needed, else all nodes.
         signals = self.signals[:, frames if weights is None else slice(None)]
@@ -337,7 +333,7 @@ def _by_film(
         q = shares[0][:, np.newaxis] * signal
         q += second
         if before is not None:  # part of q that the inputs of the result were without
-            q += np.einsum("bp,btp->pt", weights, before.at(at, places))
+            q += np.einsum("bp,btp->pt", weights, before.difference(places, at))
         return q, signal
 
     return target, np.sqrt(np.mean(stds**2, axis=0))

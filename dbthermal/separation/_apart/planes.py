@@ -144,7 +144,7 @@ def project(inputs: Inputs, result: xr.Dataset, emissivity: Floats, threads: Exe
 
     def block(rows: slice) -> None:
         for cut in tiles.cut(inputs, rows):
-            for frames, pixels, tile in cut.parts:
+            for frames, pixels, tile in cut.sections:
                 places = cut.places[pixels]
                 row, column = np.divmod(places, width)
                 # Functions of frames that some pixels lack: no longer orthogonal to the smooth.

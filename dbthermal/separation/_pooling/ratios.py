@@ -12,7 +12,7 @@ from dbthermal.separation._subspace import reflection_ratio
 from dbthermal.separation._tiles import Pixels, Survey
 
 _OUTLIER_SIGMAS: Final = 4.0  # deviations beyond which a pixel is not of the material
-_ORDER_SIGMAS: Final = 3.0  # the same for a ratio of fewer functions
+_ORDER_SIGMAS: Final = 3.0  # deviations beyond which ratios at two orders differ not by chance
 # Energy along the axis from which there is one: deviations of the noise's, and share of it [1].
 _ENERGY_SIGMAS: Final = 8.0
 _LEAST_ENERGY: Final = 0.01
@@ -80,18 +80,19 @@ def estimate(
     if even:
         scatters = [_even(labels, count, *scatter) for scatter in scatters]
     at_order, fewer, most = (_at_order(labels, count, *scatter, noise) for scatter in scatters)
+    resolved = np.isfinite(most[1])
+    ratio, variance = (np.where(resolved, *pair) for pair in zip(most, at_order, strict=True))
     # An object's curve that hides in noise, of an energy A = s^2 / (k - 1)^2, turns the ratio by
     # (k - 1) A / E beside a reflection of energy E, s the deviation of the null combination.
-    known = np.isfinite(most[1])
-    ratio, variance = (np.where(known, *pair) for pair in zip(most, at_order, strict=True))
     error = noise[1:, np.newaxis] ** 2 + (ratio[1:] * noise[0]) ** 2
     pixels = total(labels, 1.0 * (survey.frames[0] > 0), count)
     hidden = (pixels * variance) ** 2 * np.max(error / (ratio[1:] - 1.0) ** 2, axis=0)
     rapid = _excess(at_order, most, error) > 0.0
-    rapid |= known & ~(hidden < _OUTLIER_SIGMAS**2 * variance)
+    # The largest order is less certain, and taken if the curve may turn the ratio of the material.
+    rapid |= resolved & ~(hidden < _OUTLIER_SIGMAS**2 * variance)
     ratio, variance = (np.where(rapid, *pair) for pair in zip(most, at_order, strict=True))
     excess = np.where(rapid, _excess(fewer, most, error), 0.0)
-    return Ratios(ratio, variance + np.where(known, excess, hidden), rapid)
+    return Ratios(ratio, variance + np.where(resolved, excess, hidden), rapid)
 
 
 def _even(labels: Labels, count: int, scatter: Array, frames: Array) -> tuple[Array, Array]:

@@ -103,7 +103,7 @@ class History:
         for cut in tiles.cut(inputs, slice(rows[0], rows[-1] + 1)):
             maps = np.full((7, cut.status.size), np.nan, np.float32)
             second = self._gain[cut.window].ravel().astype(np.float64)
-            for _, pixels, tile in cut.parts:
+            for _, pixels, tile in cut.sections:
                 estimate: Any = separate_smooth(replace(tile, gain=second[pixels]), inputs.settings)
                 (a, b), (_, d) = estimate.emissivity_covariance
                 ratio = estimate.reflection_ratio[1], estimate.reflection_ratio_std[1] ** 2
