@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from dbthermal._arrays import Array, Mask
+from dbthermal._arrays import Array, Mask, parts
 from dbthermal._compiled import compiled
 
 Whole = npt.NDArray[np.intp]
@@ -252,3 +252,33 @@ def _arnoldi(position: Array, order: int) -> Array:
             following = following - previous @ (previous.T @ following)
         columns[:, degree] = following / np.linalg.norm(following)
     return columns
+
+
+def bridge(film: npt.NDArray[Any], pixels: Mask) -> npt.NDArray[Any]:
+    """Bridge samples of a film (time, pixel) without a number by lines, in place, at some pixels.
+
+    Before the first number and after the last these go on. Returns the film.
+    """
+    last = np.full(pixels.size, -1)
+    for frames in parts(film):
+        _bridge(film, frames.start, min(frames.stop, len(film)), pixels, last)
+    for pixel in np.flatnonzero(pixels & (last >= 0) & (last < len(film) - 1)):
+        film[last[pixel] + 1 :, pixel] = film[last[pixel], pixel]
+    return film
+
+
+@compiled
+def _bridge(film: Any, start: int, stop: int, pixels: Mask, last: Any) -> None:
+    """Bridge the gaps of pixels that end in some frames, in place; the last frame with a number."""
+    for frame in range(start, stop):
+        for pixel in range(pixels.size):
+            if not pixels[pixel] or not np.isfinite(film[frame, pixel]):
+                continue
+            before = last[pixel]
+            if before < frame - 1:
+                # A curve begins as its first number.
+                first = film[before if before >= 0 else frame, pixel]
+                slope = (np.float64(film[frame, pixel]) - first) / (frame - before)
+                for between in range(before + 1, frame):
+                    film[between, pixel] = slope * (between - before) + first
+            last[pixel] = frame

@@ -183,20 +183,11 @@ def bridged(film: Movie) -> tuple[Movie, Array]:
     Second, the share of samples (pixel) that are measured; a pixel without any is zero.
     """
     measured = schema.measured(film)
-    pixels = np.flatnonzero(~measured.all(axis=0))
-    if not pixels.size:
+    if measured.all():
         return film, np.ones(film.shape[1])
-    present, frame = measured[:, pixels], np.arange(len(film))[:, np.newaxis]
-    before = np.maximum.accumulate(np.where(present, frame, -1), axis=0)
-    after = np.minimum.accumulate(np.where(present, frame, frame.size)[::-1], axis=0)[::-1]
-    # Before the first and after the last sample their values go on.
-    first, last = after[0] % frame.size, before[-1].clip(0)
-    before, after = np.where(before < 0, first, before), np.where(after == frame.size, last, after)
-    weight = ((frame - before) / np.maximum(after - before, 1)).astype(np.float32)
-    result, samples = film.copy(), np.where(present, film[:, pixels], np.float32(0.0))
-    low, high = (np.take_along_axis(samples, place, 0) for place in (before, after))
-    result[:, pixels] = low + weight * (high - low)
-    return result, measured.mean(axis=0)
+    result = np.where(measured, film, np.float32(np.nan))
+    smooth.bridge(result, measured.any(axis=0))
+    return np.nan_to_num(result, copy=False), measured.mean(axis=0)
 
 
 def rapid(signal: npt.NDArray[Any], smoothing: Array) -> npt.NDArray[Any]:

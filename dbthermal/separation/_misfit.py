@@ -26,7 +26,6 @@ from dbthermal import schema
 from dbthermal._arrays import Array, Mask, quotient, release
 from dbthermal._compiled import compiled
 from dbthermal.separation import _tiles as tiles
-from dbthermal.separation._apart.equations import bridge
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._quality import MOST_BRIDGED
 from dbthermal.separation._subspace.fused import FILMS
@@ -293,7 +292,7 @@ def reflected(inputs: Inputs, result: xr.Dataset, rows: slice) -> Reading:
     pixels &= (result["status"].values[rows].ravel() == 0) & np.isfinite(emissivity).all(axis=0)
     finite = np.isfinite(film)
     pixels &= np.mean(finite, axis=0) > 1.0 - MOST_BRIDGED
-    film = film if finite.all() else bridge(film, pixels)
+    film = film if finite.all() else smooth.bridge(film, pixels)
     lowest, highest = film.min(axis=0), film.max(axis=0)
     center, half = 0.5 * (lowest + highest), np.maximum(0.5 * (highest - lowest), 1.0)
     nodes, powers = center + _NODES[:, np.newaxis] * half, np.vander(_NODES, increasing=True)

@@ -164,20 +164,6 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     ----------
     .. [1] Narayanan, Ramanagopal, Narasimhan (2026), Dual Band Thermal Videography, CVPR;
        doi:10.48550/arXiv.2509.11334
-
-    Examples
-    --------
-    Plate glass that warms up while people walk by, simulated:
-
-    >>> import numpy as np, xarray as xr
-    >>> from dbthermal import simulation
-    >>> rig, rng = simulation.Rig(), np.random.default_rng(1)
-    >>> glass = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(rig.bands)})
-    >>> scene = simulation.walkers(np.arange(200) / 10, (4, 6), glass, rng)
-    >>> result = solve(simulation.observe(scene, rig.response(), rng), rig.response())
-    >>> error = result["object_temperature"] - scene["object_temperature"]
-    >>> bool(abs(error).where(result["status"] == 0).median() < 0.3)  # K
-    True
     """
     require_workers(workers)
     require_seed(seed)

@@ -23,7 +23,7 @@ from dbthermal import separation, simulation
 
 PACKAGE = Path(dbthermal.__file__).parent
 MOST_ROOMS, MOST_RETURNS = 14, 8
-MOST_OF_SEPARATE = {"one place": (30, 34), "apart": (41, 78)}
+MOST_OF_SEPARATE = {"one place": (30, 34), "apart": (40, 78)}
 
 Function = tuple[str, str]
 

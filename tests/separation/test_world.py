@@ -66,14 +66,6 @@ LEAST, FEW, MOST_RMSE = 0.9, 0.05, 1.3
 MISSED = {
     ("lenses blur unlike", 1): "RMSE 1.4 times: details of the object stay unlike",
     **{
-        (
-            "one way, quick",
-            seed,
-        ): "0.8996 and 0.87 hold: 3 to 5 pixels a frame, as far as the views "
-        "lie apart; errors at the border of the materials reach the pixels paired with it"
-        for seed in (1, 2)
-    },
-    **{
         (f"slow filter wheel{stamps}", 1): "0.83 hold: edges that move by 2 to 4 pixels from frame "
         "to frame are not what is interpolated half-way"
         for stamps in ("", ", stamped")

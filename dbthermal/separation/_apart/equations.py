@@ -14,7 +14,6 @@ from scipy.special import chdtri
 from dbthermal import _smooth as smooth
 from dbthermal import schema
 from dbthermal._arrays import Array, parts
-from dbthermal._compiled import compiled
 from dbthermal.response import Curve
 from dbthermal.separation import _quality as quality
 from dbthermal.separation._apart import relaxation
@@ -202,33 +201,6 @@ def measured(film: Floats) -> Mask:
     return result
 
 
-def bridge(film: Floats, solved: Mask) -> Floats:
-    """Bridge the frames of solved pixels without a number, in place, by a line; return the film."""
-    last = np.full(solved.size, -1)
-    for frames in parts(film):
-        _bridge(film, frames.start, min(frames.stop, len(film)), solved, last)
-    for pixel in np.flatnonzero(solved & (last >= 0) & (last < len(film) - 1)):
-        film[last[pixel] + 1 :, pixel] = film[last[pixel], pixel]
-    return film
-
-
-@compiled
-def _bridge(film: Floats, start: int, stop: int, solved: Mask, last: Whole) -> None:
-    """Bridge the gaps of pixels that end in some frames, in place; the last frame with a number."""
-    for frame in range(start, stop):
-        for pixel in range(solved.size):
-            if not solved[pixel] or not np.isfinite(film[frame, pixel]):
-                continue
-            before = last[pixel]
-            if before < frame - 1:
-                # A curve begins as its first number.
-                first = film[before if before >= 0 else frame, pixel]
-                slope = (np.float64(film[frame, pixel]) - first) / (frame - before)
-                for between in range(before + 1, frame):
-                    film[between, pixel] = slope * (between - before) + first
-            last[pixel] = frame
-
-
 @dataclass(frozen=True)
 class Change:
     """Change of e_1 u_1(x) in the reference band from r to p, of loose pixels: smooth over time."""
@@ -312,7 +284,7 @@ def _film(inputs: Inputs, pixels: Whole) -> Floats:
     places = np.divmod(pixels, inputs.capture.sizes["x"])
     row, column = (xr.DataArray(place, dims="pixel") for place in places)
     film = _signal(inputs, y=row, x=column)
-    return np.nan_to_num(bridge(film, np.ones(pixels.size, dtype=bool)))
+    return np.asarray(np.nan_to_num(smooth.bridge(film, np.ones(pixels.size, dtype=bool))))
 
 
 def _signal(inputs: Inputs, **places: Any) -> Floats:

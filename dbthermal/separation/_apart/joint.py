@@ -138,7 +138,7 @@ class Joint:
         every = []
         for rows in self.inputs.blocks:
             film = np.array(background[:, rows]).reshape(time.size, -1)
-            every.append(basis.T @ system.bridge(film, np.ones(film.shape[1], dtype=bool)))
+            every.append(basis.T @ smooth.bridge(film, np.ones(film.shape[1], dtype=bool)))
             release()
         curves = np.concatenate(every, axis=1).reshape(-1, *status.shape)
         # Beside a pixel without a background it is taken to go on.
@@ -322,7 +322,7 @@ def _by_film(
     stds = stds[looked_at(frames)][:, places]
     # In units of the deviation or, of a method without one, of the noise.
     stds = np.where(np.isfinite(stds), stds, inputs.noise.min())
-    film = system.bridge(copied(film), np.isin(np.arange(film.shape[1]), places))
+    film = smooth.bridge(copied(film), np.isin(np.arange(film.shape[1]), places))
     weights, curve = system.weights(inputs, raw)[1:, places], inputs.curves[inputs.bands[0]]
 
     def target(at: Whole) -> tuple[Floats, Floats]:

@@ -10,7 +10,7 @@ they are, and a map of each product is blurred at once, not a film.
 """
 
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -71,6 +71,26 @@ class Scatters:
         across = trace - np.linalg.eigvalsh(whole)[:, -1]
         return np.asarray(across > _APART * np.sqrt(2.0 * (bands - 1) * self.freedom))
 
+    @np.errstate(invalid="ignore", divide="ignore", over="ignore")
+    def uncontradicted(self, material: tiles.Material) -> tiles.Material:
+        """Material with the ratios of the pixel where its bands contradict those of its material.
+
+        As where the second camera sees another material at p than the first at r. There the method
+        has the pixel's ratios, too (`pixel.ratios`); its object is what pixels paired with p get.
+        """
+        white = self.freedom[:, np.newaxis, np.newaxis] * np.eye(len(self.noise))
+        whole = np.moveaxis(self.scatter, -1, 0) + white
+        unlike = ~reflection_ratio.agrees(whole, material.ratio / self.noise)
+        unlike &= self.usable & np.isfinite(material.ratio[-1])
+        ratio = self.ratio
+        inverse = reflection_ratio.inverse_energy(self.scatter, ratio, self.noise, self.freedom)
+        return replace(
+            material,
+            ratio=np.where(unlike, ratio, material.ratio),
+            inverse_energy=np.where(unlike, inverse, material.inverse_energy),
+            emissivity=np.where(unlike, np.nan, material.emissivity),
+        )
+
 
 @dataclass(frozen=True)
 class Planes:
@@ -108,7 +128,9 @@ class Planes:
         bands, pixels = len(self.maps), self.usable.size
         noise, maps = self.noise[0].reshape(bands, -1), self.maps
         if blur > 0.0:
-            taps = _gaussian(blur)
+            reach = int(TAIL * blur)
+            taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / blur) ** 2)
+            taps /= taps.sum()
             share = np.maximum(_smoothed(self.usable * 1.0, taps), _LEAST_SHARE)
             maps = _smoothed(maps, taps.astype(np.float32)) / share.astype(np.float32)
             # White noise before the resampling: a blur does not see what that did to it.
@@ -268,13 +290,6 @@ def _functions(inputs: Inputs) -> Array:
     functions = np.zeros((frames.size, rapid.shape[1]))
     functions[frames] = rapid
     return functions
-
-
-def _gaussian(deviation: float) -> Array:
-    """Weights of a Gaussian, which sum to 1."""
-    reach = int(TAIL * deviation)
-    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / deviation) ** 2)
-    return np.asarray(weights / weights.sum())
 
 
 def _smoothed(maps: npt.NDArray[Any], taps: npt.NDArray[Any]) -> npt.NDArray[Any]:

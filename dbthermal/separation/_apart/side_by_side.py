@@ -90,12 +90,12 @@ def pooled(
             neighbours.materials, scatters=scatters, per_pixel=before, pooled=materials
         )
         inputs, material = pool.regrouped(inputs, survey, regroup if turn == 0 else None)
-        source = before
+        source, of_pixels = before, material and scatters[0.0].uncontradicted(material)
         if not frames.smooth:
             separate_pixels(inputs, material)
             source = result
         objects = joint.solve(
-            inputs, source, threads, frames, maps=maps, material=material, before=objects
+            inputs, source, threads, frames, maps=maps, material=of_pixels, before=objects
         )
         if objects is None:  # the object hardly differs between the places
             break

@@ -147,8 +147,7 @@ def outliers(
     go first: at least half as far as the farthest of the material.
     """
     rapid = material.rapid[labels]
-    axis = common.ratio / noise[:, np.newaxis]
-    axis = axis / np.sqrt((axis**2).sum(axis=0))
+    whitened = common.ratio / noise[:, np.newaxis]
     result = np.zeros(labels.shape, dtype=bool)
     for order in range(1, len(survey.frames)):
         scatter = np.where(rapid, survey.scatter[order], survey.scatter[0])
@@ -162,7 +161,7 @@ def outliers(
         farthest = np.zeros(len(material.rapid))
         np.maximum.at(farthest, labels, score)
         distant = score > np.maximum(_OUTLIER_SIGMAS, 0.5 * farthest[labels])
-        result |= distant & ~reflection_ratio.agrees(whole, axis)
+        result |= distant & ~reflection_ratio.agrees(whole, whitened)
     informed = np.isfinite(material.variance[labels])
     return np.asarray(result & informed & (survey.frames[0] > 0) & (labels >= 0))
 

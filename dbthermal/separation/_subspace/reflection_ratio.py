@@ -84,12 +84,13 @@ def _ratio_error(ratio: Array, noise: Array) -> Array:
     return squares + ratio**2 * squares[0]
 
 
-def agrees(scatter: Array, axis: Array) -> Mask:
-    """Pixels of which the scatter (pixel, band, band) agrees with a unit axis (band, pixel).
+def agrees(scatter: Array, whitened: Array) -> Mask:
+    """Pixels of which the scatter (pixel, band, band) agrees with whitened ratios (band, pixel).
 
     Of a background along the unit vector v and white noise, the part across v is not correlated
     with that along it: :math:`|S v|^2 / (v^T S v) - v^T S v` is a chi-square variable.
     """
+    axis = whitened / np.sqrt((whitened**2).sum(axis=0))
     turned = np.einsum("pbc,cp->bp", scatter, axis)
     along = (axis * turned).sum(axis=0)
     statistic = (turned**2).sum(axis=0) / along - along
