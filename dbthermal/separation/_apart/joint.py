@@ -36,7 +36,7 @@ from dbthermal.separation._apart.planes import Planes
 from dbthermal.separation._apart.relaxation import Floats
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._subspace import regression
-from dbthermal.separation._subspace.reflection_ratio import null_combination
+from dbthermal.separation._subspace.reflection_ratio import null_combination, ratio_variance
 from dbthermal.separation._tiles import USELESS, Mask, Material, Whole
 
 _OBJECT: Final = ("object_temperature", "object_temperature_std")
@@ -157,9 +157,12 @@ class Joint:
             squares = [np.tensordot(basis, component[:, rows], 1) ** 2 for component in slopes]
             std[:, rows] = np.sqrt(factor[rows] * std[:, rows] ** 2 + sum(squares))
             release()
-        unsettled = self.unsettled.reshape(status.shape) & (status == 0)
+        # Without a solution x(p) was taken for x(r), which may be K off beside a gray surface.
+        unsolved = self.unsettled | np.isnan(self.signals[0]).all(axis=0)
         grown = np.isnan(factor)  # without a solution, whatever stands there
-        status[unsettled | grown] |= np.uint32(Status.NOT_CONVERGED)
+        status[unsolved.reshape(status.shape) & (status == 0) | grown] |= np.uint32(
+            Status.NOT_CONVERGED
+        )
         for name in result.data_vars:
             if str(name).startswith(("object", "background", "emissivity")):
                 result[name].values[..., grown] = np.nan
@@ -185,12 +188,12 @@ def solve(
     """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         maps = maps if frames.smooth else None
-        raw, solved = _solvable(inputs, result, maps, material)
+        raw, variance, solved = _solvable(inputs, result, maps, material)
         equations = system.equations(inputs, system.inside(raw), solved)
         pooled = material is not None and np.isfinite(material.emissivity).any()
         sampled = frames.nodes if pooled and frames.smooth else looked_at(result.sizes["time"])
         places = equations.solved
-        change = system.change(inputs, equations.ways[relaxation.LOOSE], result)
+        change = system.change(inputs, equations.ways[relaxation.LOOSE])
         shares = system.coefficients(inputs, raw, solved)[:, places]
         if maps is not None:
             target, size = _by_maps(inputs, maps, raw, material, result, places)
@@ -220,7 +223,8 @@ def solve(
         of_slope: Floats = np.zeros(solved.size)
         of_ratio: Floats = np.zeros(solved.size)
         if material is not None and pooled:
-            of_slope = np.nan_to_num(material.noise_variance)
+            unknown = np.isnan(material.emissivity)
+            of_slope = np.where(unknown, np.nan_to_num(variance), material.noise_variance)
             of_ratio = system.of_ratio(inputs, material)
         elif not inputs.method.knows_emissivity:
             first, steps = system.samples(inputs, sampled)
@@ -246,14 +250,17 @@ def solve(
 
 def _solvable(
     inputs: Inputs, result: xr.Dataset, maps: Planes | None, material: Material | None
-) -> tuple[Floats, Mask]:
-    """Emissivities (band, pixel) [1] of the equations, and the pixels that have one."""
+) -> tuple[Floats, Floats, Mask]:
+    """Emissivities (band, pixel) [1] of pixels or as around, the first's variance, and where."""
     film = result["object_temperature"].values.reshape(result.sizes["time"], -1)
-    raw, solved = system.first_emissivity(inputs, result), system.measured(film)
+    measured = np.isfinite(result["emissivity"].values[inputs.bands[0]].ravel())
+    leaning, variance = neighbours.emissivities(inputs, result)
+    raw = np.where(measured, system.first_emissivity(inputs, result), leaning)
+    solved = system.measured(film)
     if maps is not None and material is not None:
         raw, sharp = system.of_material(inputs, raw, material)
         solved |= sharp & maps.usable.ravel()
-    return raw, solved & np.all(np.isfinite(raw), axis=0)
+    return raw, variance, solved & np.all(np.isfinite(raw), axis=0)
 
 
 def _spread(
@@ -293,11 +300,9 @@ def _by_maps(
     combined, variance = maps.combined(weights, places)
     if material is not None:
         std = result["reflection_ratio_std"].values[inputs.bands].reshape(len(noise), -1)[:, places]
-        size = np.sqrt(noise[:, np.newaxis] ** 2 + (ratio * noise[0]) ** 2)  # eq. 4
-        pooled = np.sqrt(material.inverse_energy[places]) * size
+        pooled = np.sqrt(ratio_variance(ratio, material.inverse_energy[places], noise))
         std = np.where(np.isnan(pooled), std, pooled)
         off = ratio + np.where(np.isnan(material.emissivity[places]), np.nan_to_num(std), 0.0)
-        off[0] = 1.0
         change, _ = maps.combined(null_combination(off, noise)[0] - weights, places)
         variance = variance + np.mean((maps.object_part @ change) ** 2, axis=0)
 

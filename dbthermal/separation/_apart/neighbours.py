@@ -199,13 +199,16 @@ def _blurred(sharp: Material, less: Material, more: Material, noise: Array) -> M
 
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
-def emissivities(inputs: Inputs, result: xr.Dataset) -> Floats:
-    """Emissivities (band, pixel) [1] of a result that lean on those around, inside of (0, 1)."""
+def emissivities(inputs: Inputs, result: xr.Dataset) -> tuple[Floats, Floats]:
+    """Emissivities (band, pixel) [1] of a result that lean on those around, inside of (0, 1).
+
+    And the variance (pixel) of that of the reference band.
+    """
     raw, reference = system.first_emissivity(inputs, result), inputs.bands[0]
     variance = result["emissivity_std"].values[reference].ravel().astype(np.float64) ** 2
     sound = (result["status"].values.ravel() == 0) & (variance > 0)
-    first = shared(raw[0], variance, sound, result["status"].shape)[0]
-    return system.inside(1.0 - system.ratio_of(raw) * (1.0 - first))
+    first, variance = shared(raw[0], variance, sound, result["status"].shape)
+    return system.inside(1.0 - system.ratio_of(raw) * (1.0 - first)), variance
 
 
 def shared(

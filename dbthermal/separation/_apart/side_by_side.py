@@ -43,7 +43,7 @@ def alone(inputs: Inputs, result: xr.Dataset, separate_pixels: Each, threads: Ex
             objects = joint.solve(inputs, result, threads, frames)
             inputs = inputs if objects is None else replace(inputs, difference=objects.difference)
             separate_pixels(inputs, None)
-        shares = neighbours.emissivities(inputs, result)
+        shares, _ = neighbours.emissivities(inputs, result)
         maps = planes.project(inputs, result, shares, threads)
         material, blur = neighbours.ratios(inputs, maps, result["status"].values), neighbours.BLUR
         if not frames.smooth:
@@ -79,7 +79,7 @@ def pooled(
     assert inputs.displacement is not None
     frames = joint.Frames.of(before)
     objects: joint.Joint | None = inputs.displacement.found[_OBJECTS]
-    shares = neighbours.emissivities(inputs, before)
+    shares, _ = neighbours.emissivities(inputs, before)
     for turn in range(_TURNS):
         inputs = replace(inputs, difference=None if objects is None else objects.difference)
         # Of a smooth object the difference changes no rapid product.

@@ -255,17 +255,14 @@ def hold(
     """Replace pooled values, or widen their deviations, where they contradict the pixel alone.
 
     A pixel alone has the ratio that its own changes show, with errors of how the cameras are
-    paired, or of what is mixed at an edge, in it; at the ratio of its material they are left in the
-    object. Where pooling is right, the two differ by no more than the deviation of the pixel alone.
+    paired, or of what is mixed at an edge, in it; at its material's ratio these are in the object.
 
-    One stays alone without a label, where only alone it has no flag, and where most pixels of its
-    material are gray, pooled, too: the others are not by chance. Of cameras `apart` also where
-    pooling hardly makes its ratio more certain, and at the border of its material. With D the mean
-    square of the difference of the objects in deviations of a pixel alone, its own or that around,
-    the pooled variance is larger by D times that of the pixel alone, if that is no chance; of one
-    that tells nothing alone, by as much as around. So is that of a pixel `apart` that stays alone.
-    At one place this does not hold for a material most of whose moving pixels are gray alone: its
-    others are selected by their noise.
+    It stays alone without a label, where only alone it has no flag, and where most of its material
+    is gray when pooled; of cameras `apart` also where pooling hardly makes its ratio more certain,
+    and at borders. Else D times the variance of the pixel alone is added, with D the mean square of
+    the difference of the objects in deviations of the pixel alone, its own or that around, if it is
+    no chance; `apart` also where the pixel stays alone. At one place this does not hold for a
+    material most of whose moving pixels are gray alone: the others are selected by their noise.
     """
     sound, valid = (result["status"].values == 0 for result in (per_pixel, pooled))
     stay = sound & (~valid | (labels.values < 0))
