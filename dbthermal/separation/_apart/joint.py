@@ -36,7 +36,7 @@ from dbthermal.separation._apart.planes import Planes
 from dbthermal.separation._apart.relaxation import Floats
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._subspace import regression
-from dbthermal.separation._subspace.reflection_ratio import null_combination, ratio_variance
+from dbthermal.separation._subspace.reflection_ratio import null_combination
 from dbthermal.separation._tiles import USELESS, Mask, Material, Whole
 
 _OBJECT: Final = ("object_temperature", "object_temperature_std")
@@ -160,9 +160,8 @@ class Joint:
         # Without a solution x(p) was taken for x(r), which may be K off beside a gray surface.
         unsolved = self.unsettled | np.isnan(self.signals[0]).all(axis=0)
         grown = np.isnan(factor)  # without a solution, whatever stands there
-        status[unsolved.reshape(status.shape) & (status == 0) | grown] |= np.uint32(
-            Status.NOT_CONVERGED
-        )
+        flagged = unsolved.reshape(status.shape) & (status == 0) | grown
+        status[flagged] |= np.uint32(Status.NOT_CONVERGED)
         for name in result.data_vars:
             if str(name).startswith(("object", "background", "emissivity")):
                 result[name].values[..., grown] = np.nan
@@ -300,9 +299,11 @@ def _by_maps(
     combined, variance = maps.combined(weights, places)
     if material is not None:
         std = result["reflection_ratio_std"].values[inputs.bands].reshape(len(noise), -1)[:, places]
-        pooled = np.sqrt(ratio_variance(ratio, material.inverse_energy[places], noise))
+        size = np.sqrt(noise[:, np.newaxis] ** 2 + (ratio * noise[0]) ** 2)  # eq. 4
+        pooled = np.sqrt(material.inverse_energy[places]) * size
         std = np.where(np.isnan(pooled), std, pooled)
         off = ratio + np.where(np.isnan(material.emissivity[places]), np.nan_to_num(std), 0.0)
+        off[0] = 1.0
         change, _ = maps.combined(null_combination(off, noise)[0] - weights, places)
         variance = variance + np.mean((maps.object_part @ change) ** 2, axis=0)
 
