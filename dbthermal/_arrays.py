@@ -6,25 +6,34 @@ as the process's memory until they are released (`release`).
 
 import mmap
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from math import prod
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 from weakref import WeakSet
 
 import numpy as np
 import numpy.typing as npt
+from threadpoolctl import threadpool_limits
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
+Call = TypeVar("Call", bound=Callable[..., Any])
 
 _LEAST: Final = 2**20  # bytes of an array that is worth a file
 _PART: Final = 2**25  # bytes of a film that are held at once
 _FOLDER: ContextVar[Path | None] = ContextVar("folder", default=None)
 _MAPS: WeakSet[mmap.mmap] = WeakSet()
+
+
+def without_blas_threads(function: Call) -> Call:
+    """Decorate a function of small matrix products, on which the library's threads lose time."""
+    # On two busy processors their waiting in loops was two thirds of a separation's time.
+    limited: Call = threadpool_limits.wrap(limits=1, user_api="blas")(function)
+    return limited
 
 
 def stride(shape: tuple[int, ...], number: int) -> int:

@@ -7,10 +7,9 @@ from typing import Final
 import numpy as np
 import xarray as xr
 from scipy.ndimage import distance_transform_edt, gaussian_filter
-from threadpoolctl import threadpool_limits
 
 from dbthermal import schema
-from dbthermal._arrays import Array, Mask
+from dbthermal._arrays import Array, Mask, without_blas_threads
 from dbthermal.alignment import _matching as matching
 from dbthermal.alignment import _planes as planes
 from dbthermal.alignment._matching import Movies
@@ -78,10 +77,10 @@ def reflection_shift(corrected: xr.Dataset, response: xr.Dataset) -> xr.Dataset:
     return shift_of(corrected, Scale.of_response(response, names)).drop_vars("energy")
 
 
+@without_blas_threads  # on any number of cores the same field
 def shift_of(corrected: xr.Dataset, scale: Scale) -> xr.Dataset:
     """Displacement as `reflection_shift`, and its `energy`, see `matching.delay`."""
-    with threadpool_limits(limits=1, user_api="blas"):  # on any number of cores the same field
-        return _matched(corrected, Capture.of(corrected, scale))
+    return _matched(corrected, Capture.of(corrected, scale))
 
 
 def _matched(corrected: xr.Dataset, capture: Capture) -> xr.Dataset:

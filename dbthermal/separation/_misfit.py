@@ -19,7 +19,6 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 from scipy.ndimage import uniform_filter
-from threadpoolctl import threadpool_limits
 
 from dbthermal import _smooth as smooth
 from dbthermal import schema
@@ -102,8 +101,7 @@ def measure(inputs: Inputs, result: xr.Dataset, workers: int, *probes: Probe) ->
         return _of_rows(inputs, result, reading), sums
 
     is_long = inputs.capture["counts"][0, :, 0].size > _LONG
-    threads = ThreadPoolExecutor(1 if is_long else workers)
-    with threadpool_limits(limits=1, user_api="blas"), threads:
+    with ThreadPoolExecutor(1 if is_long else workers) as threads:
         sections, sums = zip(*threads.map(examine, inputs.blocks), strict=True)
     blocks = _Blocks(*(np.concatenate(maps, axis=-2) for maps in zip(*sections, strict=True)))
     answers = {

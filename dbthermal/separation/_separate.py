@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from dbthermal import _numbers, _samples, alignment, schema
-from dbthermal._arrays import Array
+from dbthermal._arrays import Array, without_blas_threads
 from dbthermal._warnings import warned
 from dbthermal.alignment._planes import Scale, share_displaced
 from dbthermal.alignment._reflections import seen_apart
@@ -60,6 +60,7 @@ _MANY: Final = 0.3  # share of them from which a shift does not explain it
 _SOME, _LESS = 0.05, 0.5
 
 
+@without_blas_threads
 def separate(  # noqa: PLR0913 - all but the first two by name
     corrected: xr.Dataset,
     response: xr.Dataset,

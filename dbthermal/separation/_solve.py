@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
-from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from dbthermal import schema
-from dbthermal._arrays import empty, release
+from dbthermal._arrays import empty, release, without_blas_threads
 from dbthermal._compiled import compiled
 from dbthermal.separation import _budget as budget
 from dbthermal.separation import _tiles as tiles
@@ -175,6 +174,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     return budget.added(separated(inputs, workers=workers, progress=progress)[0], inputs)
 
 
+@without_blas_threads
 def separated(
     inputs: Inputs,
     *,
@@ -199,7 +199,6 @@ def separated(
     # Separate; for displaced cameras and materials, the number of passes is not known beforehand.
     total = None if displaced or pooled else result["status"].size
     with (
-        threadpool_limits(limits=1, user_api="blas"),
         ThreadPoolExecutor(workers) as threads,
         tqdm(total=total, unit="pixel", desc=inputs.method.name, disable=not progress) as bar,
     ):

@@ -7,10 +7,9 @@ from typing import Any, Final
 
 import numpy as np
 import xarray as xr
-from threadpoolctl import threadpool_limits
 
 from dbthermal import _numbers, schema
-from dbthermal._arrays import empty, release
+from dbthermal._arrays import empty, release, without_blas_threads
 from dbthermal._compiled import compiled
 from dbthermal._coordinates import laid_on
 from dbthermal.schema import Status
@@ -155,6 +154,7 @@ class Beside:
         _numbers.real_number("surroundings_std [K]", self.surroundings_std, _SPREAD)
 
 
+@without_blas_threads
 def filled(
     result: xr.Dataset, corrected: xr.Dataset, response: xr.Dataset, context: Beside, workers: int
 ) -> xr.Dataset:
@@ -179,7 +179,7 @@ def filled(
     scene = replace(scene, level=level)
     del sample  # before the blocks take memory
     lacking = empty(result[FILMS[0]].shape, np.bool_)  # samples of a result without a film
-    with threadpool_limits(limits=1, user_api="blas"), ThreadPoolExecutor(workers) as threads:
+    with ThreadPoolExecutor(workers) as threads:
         list(threads.map(partial(_complete_rows, scene, result, lacking), inputs.blocks))
         frames = np.array([np.isfinite(frame).any() for frame in result[FILMS[0]].values])
         counts = threads.map(partial(_bridge_rows, result, frames, lacking), inputs.blocks)
