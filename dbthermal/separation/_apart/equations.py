@@ -230,12 +230,12 @@ def samples(inputs: Inputs, frames: Whole) -> tuple[Floats, Floats]:
     return first, steps
 
 
-def change(inputs: Inputs, loose: Whole) -> Change:
+def change(inputs: Inputs, loose: Whole, result: xr.Dataset) -> Change:
     """Change of the reference band's signal to p of loose pixels, smoothed over time.
 
     So smoothed it is that of e_1 u_1(x) and holds little of that of the reflection. Bad pixels have
-    no part in it. The place p may be of another material, whose signal is another: what the change
-    from the other side of r differs by is in the deviation.
+    no part in it. Where p has another ratio than r it may be of another material, whose signal is
+    another: then what the change from the other side of r differs by is in the deviation.
     """
     displacement = inputs.displacement
     assert displacement is not None
@@ -244,7 +244,12 @@ def change(inputs: Inputs, loose: Whole) -> Change:
     at_p = without(displacement.resample[loose], bad, displacement.shape[1])
     unknown = abs(at_p) @ bad > 0.0
     across = displacement.onward[loose]  # at r + d(r), nearly as far from r as p
-    between = ~unknown & (abs(across) @ bad == 0.0) & (across.sum(axis=1) > 0.0)
+    names, second = ("reflection_ratio", "reflection_ratio_std"), inputs.bands[1]
+    ratio, std = (result[name].values[second].ravel() for name in names)
+    nearest = abs(at_p).argmax(axis=1)
+    variance = (std[nearest] ** 2 + std[loose] ** 2) * chdtri(1, reflection_ratio.CHANCE)
+    unlike = ~unknown & ((ratio[nearest] - ratio[loose]) ** 2 > variance)
+    unlike &= (abs(across) @ bad == 0.0) & (across.sum(axis=1) > 0.0)
     # Only the pixels that they are made of are read.
     pixels = np.unique(np.concatenate([loose, at_p.indices, across.indices]))
     film = _film(inputs, pixels).T
@@ -259,8 +264,8 @@ def change(inputs: Inputs, loose: Whole) -> Change:
     lagged = np.nan_to_num(np.clip(lagged / energy, 0.0, 0.98))
     frames, columns = functions.functions.shape
     variance = energy * columns / frames**2 * (1.0 + lagged) / (1.0 - lagged)
-    bend = bend[between] @ functions.functions @ functions.object_part.T
-    variance[between] += np.mean(bend**2, axis=1)
+    bend = bend[unlike] @ functions.functions @ functions.object_part.T
+    variance[unlike] += np.mean(bend**2, axis=1)
     # One that is not known, beside bad pixels, may be as large as any other.
     largest = film if unknown.all() else curves @ functions.object_part.T
     variance[unknown] = np.max(largest**2, initial=0.0)
