@@ -21,11 +21,9 @@ PIECE_ORDER: Final = 5  # number of polynomials in a piece of time
 # Functions that a change point costs as much as: to choose where the polynomial changes fits noise,
 # too (Ninomiya 2015, doi:10.1007/s10463-014-0481-x). Half of them on either side.
 CHANGE_POINT: Final = 3.0
-
 # Share of a polynomial that is new beside those of lower degree, below which it is rounding [1].
 _ROUNDED: Final = 1e-6
-# Pixels of which the functions of what changes are made, for each of these.
-_FOR_EACH: Final = 8
+_FOR_EACH: Final = 8  # pixels of which a function of what changes is made
 
 
 @dataclass(frozen=True)
@@ -66,6 +64,8 @@ class Subspace:
 def leading(samples: npt.NDArray[Any], count: int) -> npt.NDArray[Any]:
     """Orthonormal functions of time (time, function) that hold most of samples (pixel, time)."""
     sample = np.asarray(samples[:: max(1, len(samples) // (_FOR_EACH * count))], np.float64)
+    # Of what was projected out rounding is left, 1e-8 of the largest; noise of 1 mK is 1e-5.
+    count = min(count, max(1, int(np.linalg.matrix_rank(sample, rtol=_ROUNDED))))
     if len(sample) < sample.shape[1]:
         return np.asarray(np.linalg.svd(sample, full_matrices=False)[2][:count].T)
     return np.asarray(np.linalg.eigh(sample.T @ sample)[1][:, : -count - 1 : -1])

@@ -32,6 +32,7 @@ ROOM: Final = 295.0  # K
 class World:
     """What a scene has beside the paper's assumptions."""
 
+    noise: Pair = (RIG.noise[0], RIG.noise[1])  # [K]
     blur: Pair = (0.0, 0.0)  # of the lenses [pixel]
     roughness: Pair = (0.0, 0.0)  # blur of what is mirrored [pixel]
     shake: Pair = (0.0, 0.0)  # of the cameras, correlated over 0.15 s [pixel]
@@ -153,7 +154,7 @@ def seen(world: World, seed: int) -> tuple[xr.Dataset, Array]:
         film_of_object = truth
         if np.any(times[band] != time):
             film_of_object = interp1d(time, truth, axis=0, fill_value="extrapolate")(times[band])
-        noise = noise_of(rng, world.flicker) * float(RESPONSE["noise"][band])
+        noise = noise_of(rng, world.flicker) * world.noise[band] * curve.reference_slope
         for frame in range(FRAMES):
             share, warm = (
                 moved(image, breath[frame]) for image in (emissivity[band], film_of_object[frame])

@@ -88,11 +88,7 @@ MILLISECONDS = xr.DataArray(100.0 * np.arange(3), dims="time", attrs={"units": "
         (FRAMES.assign_attrs(Intercept=-273.15), {}, "Invalid 'intercept' of 'array', -273.15"),
         (np.ma.masked_equal(scene(), scene()[1, 2, 3]), {}, "Missing counts in 'array': masked"),
         (scene()[0], {}, r"Invalid shape \(24, 32\) of 'array'"),
-        (
-            scene()[:0],
-            {},
-            r"Invalid shape \(0, 24, 32\) of .*Must be \(time, y, x\), not 0",
-        ),
+        (scene()[:0], {}, r"Invalid shape \(0, 24, 32\) of .*Must be \(time, y, x\), not 0"),
         (scene().tolist(), {}, "Invalid dtype int64 of 'array'"),
         *(
             (scene(), {"memory": m}, "memory.*Must be (a number|finite)")

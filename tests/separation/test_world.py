@@ -10,11 +10,12 @@ import pytest
 from scipy.interpolate import interp1d
 from worlds import RESPONSE, SHAPE, World, seen
 
-from dbthermal import alignment, separation
+from dbthermal import alignment, separation, simulation
 from dbthermal.schema import Status
 
 SKIN, PLASTIC, METAL = (0.93, 0.85), (0.75, 0.60), (0.20, 0.10)
 DETAIL = 0.01
+QUIET = (0.03, 0.08)  # noise [K]
 # Situation, the warning that it earns, and the situation without it, whose error is compared.
 WORLDS: dict[str, tuple[World, str, str]] = {
     "plain": (World(), "", ""),
@@ -61,15 +62,12 @@ WORLDS: dict[str, tuple[World, str, str]] = {
 }
 QUICK = list(WORLDS)[:8]
 CLOCKS = [name for name in WORLDS if WORLDS[name][0].clocks]
-LEAST, FEW, MOST_RMSE = 0.9, 0.05, 1.3
+LEAST, FEW, MOST_RMSE, MOST_FAR = 0.9, 0.05, 1.3, 1e-3
 # By situation and seed: what is not reached.
+_SLOW = "0.83 hold: edges that move by 2 to 4 pixels a frame are not what is interpolated half-way"
 MISSED = {
     ("lenses blur unlike", 1): "RMSE 1.4 times: details of the object stay unlike",
-    **{
-        (f"slow filter wheel{stamps}", 1): "0.83 hold: edges that move by 2 to 4 pixels from frame "
-        "to frame are not what is interpolated half-way"
-        for stamps in ("", ", stamped")
-    },
+    **{(f"slow filter wheel{stamps}", 1): _SLOW for stamps in ("", ", stamped")},
 }
 
 
@@ -140,6 +138,22 @@ def test_lost_frames_and_dead_pixels_spoil_nothing(name: str) -> None:
     error = (result["object_temperature"].values - truth)[:, sound]
     assert np.sqrt(np.nanmean(error**2)) <= MOST_RMSE * outcome(name, 2)[2]
     assert any(WORLDS[name][1] in line for line in result.attrs.get("warnings", [""]))
+
+
+def test_nothing_is_far_off_at_a_border_of_materials() -> None:
+    """What a lens mixes is in the error bars, of quiet cameras, too."""
+    capture, truth = seen(World(noise=QUIET, blur=(0.6, 0.6)), 1)
+    result = separation.separate(capture, simulation.Rig(noise=QUIET).response())
+    error = (result["object_temperature"] - truth) / result["object_temperature_std"]
+    assert np.mean(np.abs(error.values)[:, result["status"].values == 0] > 5.0) < MOST_FAR
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_short_capture_is_not_said_to_be_apart(seed: int) -> None:
+    """Of 40 frames, no function of what changes rapidly is of the object."""
+    capture, _ = seen(World(noise=QUIET), seed)
+    shorter, rig = capture.isel(time=slice(None, None, 7)), simulation.Rig(noise=QUIET)
+    assert "warnings" not in separation.separate(shorter, rig.response()).attrs
 
 
 def test_a_shaking_image_of_33_rows_is_separated() -> None:

@@ -99,8 +99,7 @@ def complete(  # noqa: PLR0913 - all that is known beside the capture, by name
     ValueError
         If a dim, unit, band or coordinate is not as described, an emissivity of the prior lies
         outside (0, 1), the surroundings are not from 150 to 3000 K, as in degrees Celsius or in
-        counts, the result is of another capture, or the bands are none of the libraries' and there
-        is no prior.
+        counts, the result is of another capture, or no library has the bands, without a prior.
 
     Notes
     -----

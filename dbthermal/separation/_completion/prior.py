@@ -12,8 +12,7 @@ from dbthermal.separation._tiles import Array, Whole
 SAMPLE_STD: Final = 0.02
 """Deviation of the emissivity of one sample of a material from that of the table [1]."""
 
-# Grid of the first emissivity for a wide prior, finer towards 1; its points for a narrow one, and
-# how far these go.
+# Grid of the first emissivity for a wide prior, finer towards 1; points and reach of a narrow one.
 _GRID: Final = np.concatenate(
     [np.linspace(0.03, 0.78, 16), np.linspace(0.8, 0.97, 18), np.linspace(0.975, 0.9975, 7)]
 )

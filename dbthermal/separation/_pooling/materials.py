@@ -103,8 +103,7 @@ def materials(
     DataArray
         `material` (y, x), int32: connected regions from 0, the largest first, less what at their
         borders may be of the neighbour; -1 for that, for pixels without a signal, for regions in
-        which no pixel has a ratio and that no neighbour takes in, and for those of less than 16
-        pixels.
+        which no pixel has a ratio and that no neighbour takes in, or of less than 16 pixels.
 
     Notes
     -----
@@ -204,8 +203,7 @@ def joined(
     """Regions (y, x) joined with those they touch, if what was pooled over each agrees.
 
     A material is cut where ratios of single pixels are biased by what their order leaves of the
-    object; pooled ratios are not. Also joined is what has no step at the border, as where an
-    emissivity changes.
+    object; pooled ratios are not. So are regions without a step, as where an emissivity changes.
     """
     if pooled is None:
         return labels

@@ -30,13 +30,11 @@ Regroup: TypeAlias = Callable[[Material | None], Labels]
 # Share of a material's pixels that have an emissivity alone, from which it is theirs [1].
 _MOST_TOLD: Final = 0.98
 _ROUNDS: Final = 6  # rounds of leaving out pixels that are not of the material
-# Share of the pixels from which those with an emissivity of their own speak for a material [1].
-_MAJORITY: Final = 0.5
+_MAJORITY: Final = 0.5  # share of a material's pixels that speak for it, from which they do [1]
 # Pixels on either side of which a resampled one is made; single ones in a material are no border.
 _REACH: Final = 2
 _SINGLE: Final = 3
-# Deviation of a pooled ratio over that of the pixel alone, from which pooling hardly helps [1].
-_HARDLY: Final = 0.5
+_HARDLY: Final = 0.5  # deviation of a ratio pooled over that alone, from which it hardly helps [1]
 _MOSTLY: Final = 0.5  # share of gray pixels from which their material is [1]
 # Square of the difference in deviations that is no chance, of a pixel and of those around [1].
 _MORE: Final = 4.0
@@ -59,7 +57,8 @@ def materials(
     """
     labels, noise = inputs.labels, inputs.noise[inputs.bands]
     assert labels is not None
-    selected, unknown = select(labels), np.full(labels.size, np.nan)
+    width, unknown = inputs.capture.sizes["x"], np.full(labels.size, np.nan)
+    selected = select(_inner(labels.reshape(-1, width)))
     places = np.flatnonzero(selected)
     if surveys is None:
         before = None if stated is None else replace(stated, noise_variance=unknown)
@@ -67,7 +66,7 @@ def materials(
     per_pixel = surveys.select_pixels(places)
     if not np.any(per_pixel.frames[0] > 0):
         return None
-    image = Image(labels, places, inputs.capture.sizes["x"])
+    image = Image(labels, places, width)
     material = estimate(image, labels[places], per_pixel, noise, stated)
     count = int(labels.max()) + 1
     conditions = per_pixel.frames[0] > 0, np.isfinite(per_pixel.emissivity)
@@ -80,6 +79,17 @@ def materials(
     surveys = survey(inputs, replace(material, noise_variance=unknown), selected)
     per_pixel.replace_pixels(asked, surveys.select_pixels(selected))
     return estimate(image, labels[places], per_pixel, noise, stated)
+
+
+def _inner(labels: Labels) -> Labels:
+    """Labels (pixel) of an image, -1 beside another one if most of a material's are elsewhere.
+
+    What a lens mixes agrees with either material, and biases its ratio by up to 4 deviations.
+    """
+    inner = minimum_filter(labels, _SINGLE) == maximum_filter(labels, _SINGLE)
+    within = np.bincount(labels[inner] + 1, minlength=labels.max() + 2)
+    few = within < _MAJORITY * np.bincount(labels.ravel() + 1)
+    return np.where(inner | few[labels + 1], labels, -1).ravel()
 
 
 def select(labels: Labels) -> Mask:
@@ -104,8 +114,7 @@ def estimate(
     maximum of the likelihood, without the bias of a mean of ratios. The emissivity is the mean of
     the pixels' own, corrected to these ratios. Both may have `gradients` over the place. A pixel
     that differs from its material by more than four standard deviations is left out. The noise is
-    that of the bands (band,) [K]; NaN for a material without information. Ratios (band, pixel) of a
-    `material` are kept.
+    that of the bands [K]; NaN for a material without information. Ratios of a `material` are kept.
     """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         count = int(image.labels.max()) + 1
@@ -261,14 +270,14 @@ def hold(
     is gray when pooled; of cameras `apart` also where pooling hardly makes its ratio more certain,
     and at borders. Else D times the variance of the pixel alone is added, with D the mean square of
     the difference of the objects in deviations of the pixel alone, its own or that around, if it is
-    no chance; `apart` also where the pixel stays alone. At one place this does not hold for a
+    no chance, or at a border; `apart` also where the pixel stays alone. At one place not for a
     material most of whose moving pixels are gray alone: the others are selected by their noise.
     """
     sound, valid = (result["status"].values == 0 for result in (per_pixel, pooled))
-    stay = sound & (~valid | (labels.values < 0))
+    stay, border = sound & (~valid | (labels.values < 0)), _border(labels.values)
     if apart:
         ratios = [result["reflection_ratio_std"].values for result in (pooled, per_pixel)]
-        stay |= sound & (_border(labels.values) | np.any(ratios[0] > _HARDLY * ratios[1], axis=0))
+        stay |= sound & (border | np.any(ratios[0] > _HARDLY * ratios[1], axis=0))
     flags = np.uint32(Status.GRAY), np.uint32(Status.NO_BACKGROUND_MOTION)
     gray = (pooled["status"].values & flags[0]) != 0
     gray_alone, still = ((per_pixel["status"].values & flag) != 0 for flag in flags)
@@ -287,7 +296,7 @@ def hold(
         release()
     unlike = np.where(stay & apart & (square > _MORE), square, 0.0)
     local = np.where(common, _neighbour_mean(square, common), 0.0)
-    more = common & ((square > _MORE) | (local > _MORE_AROUND))
+    more = common & (border | (square > _MORE) | (local > _MORE_AROUND))
     square = np.where(more, np.maximum(square, local), 1.0 * (stay & sound))
     mean = _neighbour_mean(square * variance, common | (stay & sound))
     constant = np.where(valid & ~sound, mean, 0.0)

@@ -126,8 +126,7 @@ def _joining(most: int, event: Mask) -> joining.Scratch:
 def _tree(times: bytes, events: bytes | None) -> Tree:
     """Pieces of each level of halving, down to those whose polynomial is any curve.
 
-    From times [s] and the number of shutter events before each frame. Pieces begin beside events,
-    not at them.
+    From times [s] and numbers of shutter events before each frame, at which no piece begins.
     """
     time = np.frombuffer(times)
     segment = np.zeros(time.size, np.intp) if events is None else np.frombuffer(events, np.intp)

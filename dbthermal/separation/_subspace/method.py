@@ -8,8 +8,7 @@ The image formation (`mixing`) of band m, with noise of standard deviation :math
 
    .. math:: \kappa_m = (1 - e_m) / (1 - e_1) \qquad (2)
 
-   the principal axis of the scatter of the whitened signals outside the smooth subspace,
-   projected out by P:
+   the principal axis of the whitened signals' scatter outside the smooth subspace (by P):
 
    .. math:: S_{mn} = \sum_t (P z_m)(P z_n) / (s_m s_n) \qquad (3)
 

@@ -36,8 +36,7 @@ APART: Final = 6.0  # standard deviations between two axes that are told apart
 # Time in which a sudden step is so large a share of the object's change [s].
 _AROUND: Final = 1.0
 _MOST: Final = 2.0 / 3.0
-# Parts of the capture, and the total variation of their means over its range, from which a signal
-# returns.
+# Parts of the capture; total variation of their means over its range, at which a signal returns.
 _PARTS: Final = 24
 _RETURNED: Final = 1.7
 
@@ -169,8 +168,7 @@ def returning(signal: Array) -> Mask:
 def sudden(curve: Array, std: Array, time: Array) -> Mask:
     """Pixels of which a curve (time, pixel) [K] steps from one frame to the next.
 
-    By more than most of its change within a second, and beyond its standard deviations; not over a
-    pause of the frames.
+    By more than most of its change within a second, and its deviations; not over a pause.
     """
     interval = np.diff(time)
     usual = float(np.median(interval))

@@ -165,8 +165,7 @@ def regress(
     the `noise` of the ordinate. It starts from weights of nearly the same points, or anew.
 
     With residuals of lag-one correlation :math:`\rho` only :math:`(1 - \rho) / (1 + \rho)` of
-    the points are independent; the variance is divided by that fraction. Residual and weights are
-    in place.
+    the points are independent; the variance is divided by it. Residual and weights are in place.
     """
     if again:
         slope, intercept, energy = moments(x, y, weights)
