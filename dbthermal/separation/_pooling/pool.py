@@ -267,17 +267,17 @@ def hold(
     paired, or of what is mixed at an edge, in it; at its material's ratio these are in the object.
 
     It stays alone without a label, where only alone it has no flag, and where most of its material
-    is gray when pooled; of cameras `apart` also where pooling hardly makes its ratio more certain,
-    and at borders. Else D times the variance of the pixel alone is added, with D the mean square of
-    the difference of the objects in deviations of the pixel alone, its own or that around, if it is
-    no chance, or at a border; `apart` also where the pixel stays alone. At one place not for a
-    material most of whose moving pixels are gray alone: the others are selected by their noise.
+    is gray when pooled; of cameras `apart` also where pooling hardly makes its ratio more certain.
+    Else D times the variance of the pixel alone is added, with D the mean square of the difference
+    of the objects in deviations of the pixel alone, its own or that around, if it is no chance, or
+    at a border; `apart` also where the pixel stays alone. At one place not for a material most of
+    whose moving pixels are gray alone: the others are selected by their noise.
     """
     sound, valid = (result["status"].values == 0 for result in (per_pixel, pooled))
-    stay, border = sound & (~valid | (labels.values < 0)), _border(labels.values)
+    stay = sound & (~valid | (labels.values < 0))
     if apart:
         ratios = [result["reflection_ratio_std"].values for result in (pooled, per_pixel)]
-        stay |= sound & (border | np.any(ratios[0] > _HARDLY * ratios[1], axis=0))
+        stay |= sound & np.any(ratios[0] > _HARDLY * ratios[1], axis=0)
     flags = np.uint32(Status.GRAY), np.uint32(Status.NO_BACKGROUND_MOTION)
     gray = (pooled["status"].values & flags[0]) != 0
     gray_alone, still = ((per_pixel["status"].values & flag) != 0 for flag in flags)
@@ -296,6 +296,8 @@ def hold(
         release()
     unlike = np.where(stay & apart & (square > _MORE), square, 0.0)
     local = np.where(common, _neighbour_mean(square, common), 0.0)
+    whole, size = median_filter(labels.values, _SINGLE, mode="nearest"), 1 + 2 * _REACH
+    border = minimum_filter(whole, size) < maximum_filter(whole, size)
     more = common & (border | (square > _MORE) | (local > _MORE_AROUND))
     square = np.where(more, np.maximum(square, local), 1.0 * (stay & sound))
     mean = _neighbour_mean(square * variance, common | (stay & sound))
@@ -320,12 +322,6 @@ def _share(labels: Array, holds: Mask) -> Array:
     numbers = np.unique(labels, return_inverse=True)[1].ravel()
     share = np.bincount(numbers, holds.ravel()) / np.bincount(numbers)
     return np.where(labels >= 0, share[numbers].reshape(labels.shape), 0.0)
-
-
-def _border(labels: Array) -> Mask:
-    """Pixels (y, x) at the border of a material."""
-    whole, size = median_filter(labels, _SINGLE, mode="nearest"), 1 + 2 * _REACH
-    return np.asarray(minimum_filter(whole, size) < maximum_filter(whole, size))
 
 
 def _neighbour_mean(values: Array, counted: Mask) -> Array:
