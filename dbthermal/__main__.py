@@ -346,6 +346,8 @@ def _carry_out(options: argparse.Namespace, arguments: Sequence[str]) -> int:
         else:
             with ExitStack() as places:
                 for path in targets:  # which no other process writes to from here on
+                    if "output" in options:  # and which may be replaced
+                        import_module("dbthermal.store._whole").check_place(path, path.suffix)
                     places.enter_context(import_module("dbthermal.store").reserved(path))
                 _cli.sources_and_targets(options)  # and to which none has written meanwhile
                 summary = _command(module, function)(options)

@@ -360,16 +360,8 @@ def test_blackbody_in_a_store(
     first, second = (store.open_dataset(results / f"response{n}.zarr") for n in ("", "2"))
     np.testing.assert_allclose(second["offset"], first["offset"], rtol=0, atol=1e-6)
     # What is known of the accuracy is stated, the rest is what is usual.
-    known = [
-        "--offset-std",
-        "0.2",
-        "0.3",
-        "--blackbody-accuracy",
-        "0.05",
-        "--room-temperature",
-        "25C",
-    ]
-    done(results, *names, *known, "-o", "accurate.zarr")
+    known = "--offset-std 0.2 0.3 --blackbody-accuracy 0.05 --room-temperature 25\N{DEGREE SIGN}C"
+    done(results, *names, *known.split(), "-o", "accurate.zarr")
     third = store.open_dataset(results / "accurate.zarr")
     assert third["offset_std"].values.tolist() == [0.2, 0.3]
     assert (float(third["blackbody_accuracy"]), float(third["room_temperature"])) == (0.05, 298.15)
@@ -419,6 +411,16 @@ def test_curves_films_pictures(results: Path) -> None:
         np.testing.assert_array_equal(opened["object_temperature"], object_)
         np.testing.assert_array_equal(opened["status"], result["status"])
     assert (results / "out.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_capture_is_exported_as_netcdf(results: Path) -> None:
+    """Counts from 32768 on, which the 16 bits of the format do not hold, are in it, too."""
+    scene = store.open_dataset(results / "scene.zarr")
+    store.save(scene.assign(counts=scene["counts"] | 32768), results / "bright.zarr", {})
+    done(results, "export", "bright.zarr", "-o", "bright.nc")
+    with xr.open_dataset(results / "bright.nc", engine="scipy") as opened:
+        np.testing.assert_array_equal(opened["counts"], scene["counts"] | 32768)
+        assert opened["counts"].attrs["units"] == "count"
 
 
 def test_curves_of_pixels_copy_no_film(results: Path) -> None:
@@ -474,6 +476,9 @@ def test_nothing_is_overwritten(results: Path) -> None:
     assert "lies there. Must be another place" in line
     line = refused(results, "correct", "scene.zarr", "nuc.zarr", "-o", "scene.zarr/inner.zarr")
     assert "lies there. Must be another place" in line
+    (results / "foreign.zarr").write_text("notes")
+    wrong = ["correct", "nuc.zarr", "nuc.zarr", "--overwrite", "-o", "foreign.zarr"]
+    assert "Foreign file 'foreign.zarr'" in refused(results, *wrong)  # before any work
     twice = ["-o", "new.zarr", "--correction-output", "./new.zarr"]
     line = refused(results, "calibrate", "--blackbody", "scene.zarr", *twice)
     assert "Invalid output 'new.zarr': an input or another output lies there" in line
@@ -576,7 +581,7 @@ explore result.zarr nuc.zarr -o x.ipynb -> Invalid capture 'nuc.zarr' of stage '
 report result.zarr response.zarr aligned.zarr -o x.html -> Exchanged with the response
 report result.zarr -o x.pdf -> Invalid output 'x.pdf'. Must end in '.html'
 separate aligned.zarr response.zarr -o result2 -> Invalid output 'result2'. Must end in '.zarr'
-export aligned.zarr -o x.csv -> No variable with times and pixels in 'aligned.zarr'
+export aligned.zarr -o x.csv -> No variable with times .* in 'aligned.zarr'.* .*nc takes any store
 export result.zarr --variable emissivity -o x.csv -> 'emissivity' for .csv. Must be one of
 export result.zarr --variable noise -o x.tif -> 'noise' for .tif. Must be one of
 separate aligned.zarr response.zarr --method calibrated --emissivity 1 -o x.zarr

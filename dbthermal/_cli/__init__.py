@@ -66,7 +66,7 @@ def finite(text: str) -> float:
 def kelvin(text: str) -> float:
     """Temperature [K] of a text with its unit; 273.15 as in scipy, whose import takes long."""
     try:
-        value, unit = finite(text[:-1]), text[-1:]
+        value, unit = finite(text[:-1].rstrip("\N{DEGREE SIGN} ")), text[-1:]
         temperature = round(value + {"C": 273.15, "K": 0.0}[unit], 9)
     except (KeyError, ArgumentTypeError) as error:
         rule = "Must be a number, with a decimal point, and its unit, such as 20.5C or 293.15K"

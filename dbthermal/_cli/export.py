@@ -24,16 +24,15 @@ def export(options: argparse.Namespace) -> dict[str, Any]:
     options.variable, *further = options.variable or ["object_temperature"]
     if suffix not in _WRITERS:
         raise ValueError(f"Invalid output '{options.output}'. Must end in one of {[*_WRITERS]}.")
-    names = sorted(map(str, result.data_vars))
     if suffix != ".nc":  # pictures, or curves over time
         dims, last = (("y", "x"), 2) if suffix in (".tif", *PICTURES) else (("time", "y", "x"), 4)
-        names = [name for name in names if result[name].dims[-last:] == dims]
+        names = sorted(str(name) for name in result if result[name].dims[-last:] == dims)
         if not names:
-            rule = "Must be a result, as from: dbthermal separate"
+            rule = "Must be a result, as from: dbthermal separate; *.nc takes any store"
             raise ValueError(f"No variable with times and pixels in '{options.result}'. {rule}.")
-    if further or options.variable not in names:
-        kind = f"variable '{' '.join([options.variable, *further])}' for {suffix}"
-        raise ValueError(f"Unknown {kind}. Must be one of {names}.")
+        if further or options.variable not in names:
+            kind = f"variable '{' '.join([options.variable, *further])}' for {suffix}"
+            raise ValueError(f"Unknown {kind}. Must be one of {names}.")
     # A film or picture has that of the status beside it.
     outputs = {options.output: options.variable}
     if suffix in (".tif", *PICTURES) and "status" in result and options.variable != "status":
@@ -134,7 +133,8 @@ def _picture(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dic
 
 def _netcdf(result: xr.Dataset, path: Path, _: argparse.Namespace) -> dict[str, Any]:
     """Write everything in format 3, with what its attributes cannot hold as JSON."""
-    plain = result.drop_encoding()
+    short = [name for name in result if result[name].dtype == np.uint16]  # which it has not
+    plain = result.drop_encoding().assign({name: result[name].astype("i4") for name in short})
     for attrs in (plain.attrs, *(variable.attrs for variable in plain.variables.values())):
         for name, value in attrs.items():
             if name == "warnings" or isinstance(value, dict | bool | None):
