@@ -351,8 +351,9 @@ def _carry_out(options: argparse.Namespace, arguments: Sequence[str]) -> int:
                     places.enter_context(import_module("dbthermal.store").reserved(path))
                 _cli.sources_and_targets(options)  # and to which none has written meanwhile
                 summary = _command(module, function)(options)
-    # The summary, for programs or for people.
-    lines = [json.dumps(summary, default=_cli.plain)] if options.json else _cli.lines_of(summary)
+    # The summary, for programs, in JSON, which has no NaN, or for people.
+    plain = json.loads(json.dumps(summary, default=_cli.plain), parse_constant=lambda _: None)
+    lines = [json.dumps(plain)] if options.json else _cli.lines_of(summary)
     print("\n".join(map(_shown, lines)), flush=True)
     return 0
 

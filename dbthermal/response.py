@@ -276,8 +276,7 @@ def curves(response: xr.Dataset, bands: Sequence[str], kind: str = "exact") -> l
 def _curve(number: dict[str, float], band: str, kind: str) -> Curve:
     """Curve of one band, of the numbers of its response."""
     # Refuse coefficients and a range that are no response.
-    bad = [name for name, value in number.items() if not np.isfinite(value)]
-    if bad:
+    if bad := [name for name, value in number.items() if not np.isfinite(value)]:
         raise ValueError(f"Invalid {bad[0]} of the response in band '{band}'. Must be finite.")
     common = (number["reference_temperature"], number["temperature_min"], number["temperature_max"])
     reference, lowest, highest = common

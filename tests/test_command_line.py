@@ -453,6 +453,8 @@ def test_plan_and_data(tmp_path: Path) -> None:
     assert "Assumed: 35 s at 10 Hz; the object rises by 25 K" in out
     assert re.search(r"(?m)^plate window glass  9.5 +0\.706 +0\.173 ", out)
     assert re.search(r"(?m)^brass plate +none .*\n.*Best none: no filter", out)
+    still = done(tmp_path, "plan", "brass plate", "--noise", "0.03", "--span", "0")["numbers"]
+    assert None in still["brass plate"]["object_temperature_std_K"].values()  # JSON has no infinity
     listed = done(tmp_path, "data")
     assert listed["filters_um"]["9.5"] == [9.25, 9.75]
     assert listed["emissivity"]["plate window glass"]["9.5"] == 0.718
@@ -583,6 +585,7 @@ report result.zarr -o x.pdf -> Invalid output 'x.pdf'. Must end in '.html'
 separate aligned.zarr response.zarr -o result2 -> Invalid output 'result2'. Must end in '.zarr'
 export aligned.zarr -o x.csv -> No variable with times .* in 'aligned.zarr'.* .*nc takes any store
 export result.zarr --variable emissivity -o x.csv -> 'emissivity' for .csv. Must be one of
+export result.zarr --variable bridged -o x.csv -> 'bridged' for .csv. Must be one of .'back
 export result.zarr --variable noise -o x.tif -> 'noise' for .tif. Must be one of
 separate aligned.zarr response.zarr --method calibrated --emissivity 1 -o x.zarr
  -> Must be one for each

@@ -26,8 +26,10 @@ def export(options: argparse.Namespace) -> dict[str, Any]:
         raise ValueError(f"Invalid output '{options.output}'. Must end in one of {[*_WRITERS]}.")
     if suffix != ".nc":  # pictures, or curves over time
         dims, last = (("y", "x"), 2) if suffix in (".tif", *PICTURES) else (("time", "y", "x"), 4)
-        names = sorted(str(name) for name in result if result[name].dims[-last:] == dims)
-        if not names:
+        missing = {*str(result.attrs.get("not_estimated", "")).split()}
+        missing |= {"bridged"} if last > len(dims) else set()  # no curve, nor a film to see
+        fitting = {str(name) for name in result if result[name].dims[-last:] == dims}
+        if not (names := sorted(fitting - missing)):
             rule = "Must be a result, as from: dbthermal separate; *.nc takes any store"
             raise ValueError(f"No variable with times and pixels in '{options.result}'. {rule}.")
         if further or options.variable not in names:
@@ -127,8 +129,7 @@ def _picture(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dic
     drawing.draw_image(figure, axes[0, 0], image, label, f"{label} [{unit}]")
     figure.suptitle(drawing.provenance_note(result).removeprefix(", "))
     store.save_figure(figure, path, provenance(options))
-    at = {str(k): str(v.values) for k, v in image.coords.items()}
-    return {"shape": list(image.shape), "at": at}
+    return {"shape": [*image.shape], "at": {str(k): str(v.values) for k, v in image.coords.items()}}
 
 
 def _netcdf(result: xr.Dataset, path: Path, _: argparse.Namespace) -> dict[str, Any]:
@@ -137,7 +138,7 @@ def _netcdf(result: xr.Dataset, path: Path, _: argparse.Namespace) -> dict[str, 
     plain = result.drop_encoding().assign({name: result[name].astype("i4") for name in short})
     for attrs in (plain.attrs, *(variable.attrs for variable in plain.variables.values())):
         for name, value in attrs.items():
-            if name == "warnings" or isinstance(value, dict | bool | None):
+            if not isinstance(value, str) and np.asarray(value).dtype.kind not in "fiu":
                 attrs[name] = json.dumps(value)
     plain.to_netcdf(path, engine="scipy")
     return {"variables": sorted(map(str, result.data_vars))}

@@ -253,8 +253,7 @@ def _described(paths: list[Path], options: argparse.Namespace, camera: int) -> d
     except ValueError as error:
         if options.clock is not None or not re.match("Missing (--)?clock", str(error)):
             raise
-    options = argparse.Namespace(**{**vars(options), "clock": [1.0]})  # any
-    lines = _described(paths, options, camera)
+    lines = _described(paths, argparse.Namespace(**{**vars(options), "clock": [1.0]}), camera)
     lines = {name: value for name, value in lines.items() if name not in _BY_CLOCK}
     return lines | {"clock": "not in the file: state the frame rate by --clock"}
 

@@ -243,8 +243,8 @@ class View:
         data, (rows, columns) = self.data, box
         displaced = data.attrs.get("reflection_shift", "none") != "none"
         displaced |= bool((self.status & int(Status.NO_REFLECTION_PAIR)).any())
-        needed = {*FILMS, "emissivity", "emissivity_std"}
-        if pane.name not in FILMS or displaced or not needed <= set(data):
+        estimated = {"emissivity", "emissivity_std"} <= set(data) and {*FILMS} <= set(self.panes)
+        if pane.name not in FILMS or displaced or not estimated:
             return None
         cut = data[[name for name in data if str(name).startswith("emissivity")]]
         cut = cut.isel(y=rows, x=columns)

@@ -49,6 +49,9 @@ def test_panes_of_a_result_with_its_capture(glass: Glass) -> None:
     assert "emissivity" in result.attrs["not_estimated"].split()
     assert {"input 8-14", "input 9.5", "object_temperature", "status"} <= set(view.panes)
     assert not [name for name in view.panes if name.startswith("emissivity")]
+    mean = result["object_temperature"].isel(time=0).where(result["status"] == 0).mean()
+    curve = view.curve("object_temperature", WHOLE, pixels="measured")
+    np.testing.assert_allclose(curve["mean"][0], mean, rtol=1e-6)
     apparent = apparent_temperature(response, capture["counts"].isel(time=[7]))
     np.testing.assert_allclose(view.frame("input 9.5", 7), apparent[1, 0], rtol=0, atol=5e-5)  # [K]
 
