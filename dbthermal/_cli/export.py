@@ -15,6 +15,7 @@ from scipy.constants import zero_Celsius
 
 from dbthermal import explorer, schema, store
 from dbthermal._cli.files import ANIMATED, PICTURES, opened, provenance, staged
+from dbthermal.explorer._films import FILMS
 
 
 def export(options: argparse.Namespace) -> dict[str, Any]:
@@ -113,23 +114,30 @@ def _animation(result: xr.Dataset, path: Path, options: argparse.Namespace) -> d
 
 
 def _picture(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dict[str, Any]:
-    """Draw a variable at the last time, in degrees Celsius if it is a temperature."""
+    """Draw all bands or causes of a variable at the last time, a temperature in degrees Celsius."""
     from dbthermal import figures  # noqa: PLC0415 - optional
-    from dbthermal.figures import drawing  # noqa: PLC0415 - optional
 
     if options.variable == "status":
         store.save_figure(figures.status(result), path, provenance(options))
         return {"shape": list(result["status"].shape)}
     array = result[options.variable]
-    image = array.isel({dim: -1 for dim in array.dims if dim not in ("y", "x")})
-    unit, label = array.attrs.get("units", "1"), str(array.name).replace("_", " ")
-    if unit == "K" and not label.endswith(" std"):
-        image, unit = image - zero_Celsius, "\N{DEGREE SIGN}C"
-    figure, axes = drawing.canvas(1, 1, (6.4, 4.8))
-    drawing.draw_image(figure, axes[0, 0], image, label, f"{label} [{unit}]")
-    figure.suptitle(drawing.provenance_note(result).removeprefix(", "))
+    unit, label, titles = array.attrs.get("units", "1"), array.name.replace("_", " "), list[str]()
+    if array.name in FILMS:
+        array, unit = array - zero_Celsius, "\N{DEGREE SIGN}C"
+    moment = f", {array['time'][-1]:g} s" if "time" in array.dims else ""
+    array = array.isel(time=-1, missing_dims="ignore")
+    # A picture of each band, cause or axis.
+    dims, shape = array.dims[:-2], array.shape[:-2]
+    columns = next(number for number in (3, 2, 1) if math.prod(shape) % number == 0)
+    rows = math.prod(shape) // columns
+    figure, axes = figures.drawing.canvas(rows, columns, (2.2 + 4.2 * columns, 1.6 + 3.2 * rows))
+    for axis, place in zip(axes.ravel().tolist(), np.ndindex(*shape), strict=True):
+        at = [f", {dim} {array[dim].values[n]}" for dim, n in zip(dims, place, strict=True)]
+        titles.append("".join([label, moment, *at]))
+        figures.drawing.draw_image(figure, axis, array[place], titles[-1], f"{label} [{unit}]")
+    figure.suptitle(figures.drawing.provenance_note(result))
     store.save_figure(figure, path, provenance(options))
-    return {"shape": [*image.shape], "at": {str(k): str(v.values) for k, v in image.coords.items()}}
+    return {"shape": [*array.shape[-2:]], "images": titles}
 
 
 def _netcdf(result: xr.Dataset, path: Path, _: argparse.Namespace) -> dict[str, Any]:
@@ -176,9 +184,8 @@ def explore(options: argparse.Namespace) -> dict[str, Any]:
     notebook = {"cells": [cell], "metadata": {"kernelspec": kernel}, "nbformat": 4}
     with store.whole(options.output, ".ipynb") as draft:
         draft.write_text(json.dumps(notebook | {"nbformat_minor": 5}), encoding="utf-8")
-    install = ""
-    if any(find_spec(library) is None for library in ("anywidget", "jupyterlab")):
-        install = ", in a clone: python -m pip install '.[explorer]' jupyterlab; then"
+    lacks = any(find_spec(library) is None for library in ("anywidget", "jupyterlab"))
+    install = ", in a clone: python -m pip install '.[explorer]' jupyterlab; then" * lacks
     return {str(options.output): f"opened by{install}: jupyter lab {options.output}"}
 
 
