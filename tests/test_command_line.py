@@ -401,13 +401,16 @@ def test_curves_films_pictures(results: Path) -> None:
         done(results, "export", "result.zarr", "-o", f"out.{suffix}")
     np.testing.assert_array_equal(tifffile.imread(results / "out.tif"), object_)
     np.testing.assert_array_equal(tifffile.imread(results / "out_status.tif"), status)
+    done(results, "export", "result.zarr", "--variable", "emissivity", "-o", "maps.tif")
+    with tifffile.TiffFile(results / "maps.tif") as stack:
+        assert json.loads(stack.pages.first.description)["band"] == ["8-14", "9.5"]
     with Image.open(results / "out.gif") as film:
         assert film.n_frames == FRAMES // 2  # type: ignore[attr-defined]
     assert (results / "out_status.png").read_bytes().startswith(b"\x89PNG")
     for variable, first in {"uncertainty": "cause noise", "emissivity": "band 8-14"}.items():
         drawn = done(results, "export", "result.zarr", "--variable", variable, "-o", f"{first}.svg")
         assert drawn[f"{first}.svg"]["images"][0] == f"{variable}, {first}"
-        assert "\N{DEGREE SIGN}C" not in (results / f"{first}.svg").read_text(encoding="utf-8")
+        assert "\N{DEGREE SIGN}C" not in (results / f"{first}.svg").read_text("utf-8")
     (results / "out.tif").unlink()
     line = refused(results, "export", "result.zarr", "-o", "out.tif")
     assert "There is something at 'out_status.tif'" in line

@@ -263,7 +263,7 @@ LAID: dict[str, tuple[Callable[[Any], Any], Labelled, str]] = {
     "materials": (lambda it: separation.materials(it, CAPTURE, CAMERA), RESULT, "time y x band"),
     "reflected_change": (lambda it: reflected_change(it, RESULT), APPARENT, "time y x"),
     "apparent": (lambda it: response.apparent_temperature(it, COUNTS), CAMERA, "band"),
-    "fit_response": (lambda it: fitted(it), CAMERA["noise"], "band"),
+    "fit_response": (fitted, CAMERA["noise"], "band"),
     "correct": (lambda it: correction.correct(EVEN, it), PLAIN, "y x band"),
     "renew_offset": (lambda it: correction.renew_offset(PLAIN, it), FLAT, "y x band"),
     "correct_capture flat": (

@@ -99,6 +99,7 @@ def _film(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dict[s
     array = result[options.variable]
     about = {"variable": array.name, "units": array.attrs.get("units"), **provenance(options)}
     about |= schema.origin(result.attrs)
+    about |= {str(dim): array[dim].values.tolist() for dim in array.dims[:-2] if dim != "time"}
     values = array.values.astype(np.float32) if array.dtype.kind == "f" else array.values
     tifffile.imwrite(path, values, photometric="minisblack", description=json.dumps(about))
     return {"shape": list(values.shape), "dtype": str(values.dtype), "units": about["units"]}
@@ -106,10 +107,9 @@ def _film(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dict[s
 
 def _animation(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dict[str, Any]:
     """Animate a variable, in degrees Celsius if it is a temperature."""
-    from dbthermal.explorer import _export  # noqa: PLC0415 - optional
+    from dbthermal.explorer._export import Shown, save_film  # noqa: PLC0415 - optional
 
-    shown = _export.Shown([options.variable], 0, {}, celsius=True)
-    _export.save_film(explorer.View(result), path, shown)
+    save_film(explorer.View(result), path, Shown([options.variable], 0, {}, celsius=True))
     return {"bytes": path.stat().st_size}
 
 
