@@ -192,7 +192,7 @@ sessions/scene.yaml recordings --dry-run
 sessions/scene.yaml recordings --simulate
 
 export export.export result --variable --pixel --region --output
-write a result for other programs: curves, film, picture, or everything as NetCDF
+write a result for other programs: curves, film, picture; or any store as NetCDF
 result.zarr --pixel 120 200 --region 10 60 10 90 -o curves.csv
 result.zarr --variable background_temperature -o film.tif
 result.zarr -o object.png

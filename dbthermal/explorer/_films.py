@@ -16,7 +16,7 @@ from scipy.special import chdtri
 
 from dbthermal import _rows, _text, schema, store
 from dbthermal import response as responses
-from dbthermal._arrays import Array, Mask, empty, on_disk, release
+from dbthermal._arrays import Array, Mask, empty, on_disk, quotient, release
 from dbthermal._coordinates import laid_on
 
 Values = npt.NDArray[np.float32]
@@ -264,7 +264,7 @@ def common_gain(emissivity: Array, covariance: Array) -> Array:
         first, second = np.delete(inverse, -1, axis), np.delete(inverse, 0, axis)
         step = np.einsum("yxib,byx->iyx", first + second, np.diff(value, axis=1 + axis)) / 2.0
         total = np.delete(variance, -1, 1 + axis) + np.delete(variance, 0, 1 + axis)
-        ratios.append(np.reshape(step**2 / total, (2, -1)))
+        ratios.append(np.reshape(quotient(step**2, total, np.nan), (2, -1)))
     pairs = np.concatenate(ratios, axis=1)
     pairs = pairs[:, np.isfinite(pairs).all(axis=0)]
     residual_share = np.zeros(2)

@@ -90,10 +90,7 @@ MILLISECONDS = xr.DataArray(100.0 * np.arange(3), dims="time", attrs={"units": "
         (scene()[0], {}, r"Invalid shape \(24, 32\) of 'array'"),
         (scene()[:0], {}, r"shape \(0, 24, 32\) of .*Must be \(time, y, x\), not 0"),
         (scene().tolist(), {}, "Invalid dtype int64 of 'array'"),
-        *(
-            (scene(), {"memory": m}, "memory.*Must be (a number|finite)")
-            for m in ("1e9", np.nan, True)
-        ),
+        *((scene(), {"memory": it}, "memory.*Must be (a n|fin)") for it in ("1e9", np.nan, True)),
         (scene(), {"unit": ["count"]}, "unit.*Must be 'count'"),
         (scene(), {"clock": None}, "Missing clock= for 'array', which tells no times"),
         *(
