@@ -276,8 +276,7 @@ class View:
         """Noise of the samples of a band, with what is left of its pattern; NaN if not known."""
         assert self.capture is not None
         holders = [holder for holder in (self.response, self.data) if holder is not None]
-        stated = [holder["noise"] for holder in holders if "noise" in holder]
-        if not stated:
+        if not (stated := [holder["noise"] for holder in holders if "noise" in holder]):
             return np.full(values.shape, np.nan)
         band = pane.name.removeprefix("input ")
 
