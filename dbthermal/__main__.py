@@ -192,7 +192,7 @@ sessions/scene.yaml recordings --dry-run
 sessions/scene.yaml recordings --simulate
 
 export export.export result --variable --pixel --region --output
-write a result for other programs: curves, film, picture, or everything as NetCDF
+write a result for other programs: curves, film, picture; or any store as NetCDF
 result.zarr --pixel 120 200 --region 10 60 10 90 -o curves.csv
 result.zarr --variable background_temperature -o film.tif
 result.zarr -o object.png
@@ -346,11 +346,14 @@ def _carry_out(options: argparse.Namespace, arguments: Sequence[str]) -> int:
         else:
             with ExitStack() as places:
                 for path in targets:  # which no other process writes to from here on
+                    if "output" in options:  # and which may be replaced
+                        import_module("dbthermal.store._whole").check_place(path, path.suffix)
                     places.enter_context(import_module("dbthermal.store").reserved(path))
                 _cli.sources_and_targets(options)  # and to which none has written meanwhile
                 summary = _command(module, function)(options)
-    # The summary, for programs or for people.
-    lines = [json.dumps(summary, default=_cli.plain)] if options.json else _cli.lines_of(summary)
+    # The summary, for programs, in JSON, which has no NaN, or for people.
+    plain = json.loads(json.dumps(summary, default=_cli.plain), parse_constant=lambda _: None)
+    lines = [json.dumps(plain)] if options.json else _cli.lines_of(summary)
     print("\n".join(map(_shown, lines)), flush=True)
     return 0
 

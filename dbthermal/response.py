@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from dbthermal import planck, schema
+from dbthermal import _numbers, planck, schema
 from dbthermal._arrays import Array
 
 __all__ = [
@@ -210,14 +210,12 @@ def accuracy(
     That is a deviation that is negative or not finite, or an emissivity outside (0, 1]. A reference
     in view, attribute of a capture, renews the levels at its temperature, and perhaps the gains.
     """
-    places, stated = schema.band_positions(response, bands, "the response"), {}
+    places, stated = schema.band_positions(response, bands, "the response"), dict[str, Array]()
+    limits = {"blackbody_emissivity": (1e-3, 1.0), "room_temperature": _numbers.KELVIN}
     for name, default in ACCURACY.items():
-        value = np.asarray(response[name].values if name in response else default, np.float64)
-        low, high = (1e-3, 1.0) if name == "blackbody_emissivity" else (0.0, schema.LARGEST)
-        if not np.all((value >= low) & (value <= high)):
-            rule = f"Must lie in [{low:g}, {high:g}]"
-            raise ValueError(f"Invalid {name} {value.tolist()} of the response. {rule}.")
-        stated[name] = value
+        value = response[name].values if name in response else default
+        within = limits.get(name, (0.0, schema.LARGEST))
+        stated[name] = _numbers.real_numbers(f"{name} of the response", value, within)
     offset, gain, pattern = (
         np.broadcast_to(stated[name], response.sizes["band"])[places]
         for name in ("offset_std", "gain_std", "pattern_std")
@@ -278,8 +276,7 @@ def curves(response: xr.Dataset, bands: Sequence[str], kind: str = "exact") -> l
 def _curve(number: dict[str, float], band: str, kind: str) -> Curve:
     """Curve of one band, of the numbers of its response."""
     # Refuse coefficients and a range that are no response.
-    bad = [name for name, value in number.items() if not np.isfinite(value)]
-    if bad:
+    if bad := [name for name, value in number.items() if not np.isfinite(value)]:
         raise ValueError(f"Invalid {bad[0]} of the response in band '{band}'. Must be finite.")
     common = (number["reference_temperature"], number["temperature_min"], number["temperature_max"])
     reference, lowest, highest = common

@@ -353,8 +353,7 @@ def has_flag(flags: xr.DataArray, *names: str) -> xr.DataArray:
     """
     meanings = str(flags.attrs.get("flag_meanings", "")).split()
     masks = dict(zip(meanings, np.atleast_1d(flags.attrs.get("flag_masks", [])), strict=True))
-    unknown = [name for name in names if name not in masks]
-    if unknown:
+    if unknown := [name for name in names if name not in masks]:
         raise ValueError(f"Unknown flag '{unknown[0]}'. Must be one of {meanings}.")
     mask = sum({int(masks[name]) for name in names})
     return flags.copy(data=(flags.values & flags.dtype.type(mask)) != 0).drop_attrs()
@@ -443,7 +442,8 @@ def check_variable(array: xr.DataArray, variable: Variable, label: str) -> None:
         flags = variable in (STATUS, SEGMENT)  # whole numbers, whose unit says nothing
         check_numbers(array, label, None if flags else variable.units)
         if flags and array.dtype.kind == "f":
-            raise TypeError(f"Invalid dtype {array.dtype} of {label}. Must be whole numbers.")
+            rule = "Must be whole numbers: mask, average or fill single variables, not the Dataset"
+            raise TypeError(f"Invalid dtype {array.dtype} of {label}. {rule}.")
     elif array.dtype != bool:
         raise TypeError(f"Invalid dtype {array.dtype} of {label}. Must be bool.")
     for dim in array.dims:
@@ -456,8 +456,10 @@ def check_variable(array: xr.DataArray, variable: Variable, label: str) -> None:
 def check_numbers(array: xr.DataArray, label: str, units: str | None = None) -> xr.DataArray:
     """Check that an array holds real numbers, of a unit if it states one, and return it."""
     require(array, xr.DataArray, label)
-    if array.dtype.kind not in "fui":
-        raise TypeError(f"Invalid dtype {array.dtype} of {label}. Must be a real number.")
+    if array.dtype.kind not in "fui" or array.dtype.itemsize > 8:
+        rule = "Must be a real number" + " of at most 64 bits" * (array.dtype.kind in "fui")
+        rule += ": of dates (time - time[0]) / np.timedelta64(1, 's')" * (array.dtype.kind in "mM")
+        raise TypeError(f"Invalid dtype {array.dtype} of {label}. {rule}.")
     if units is not None and array.attrs.get("units", units) != units:
         raise ValueError(f"Invalid units '{array.attrs['units']}' of {label}. Must be '{units}'.")
     return array
@@ -471,8 +473,7 @@ def band_positions(array: xr.DataArray | xr.Dataset, wanted: list[str], label: s
     names = [str(name) for name in np.atleast_1d(array["band"].values)]
     if len(set(names)) != len(names):
         raise ValueError(f"Repeated band in {names} of {label}. Each band must occur once.")
-    missing = [name for name in wanted if name not in names]
-    if missing:
+    if missing := [name for name in wanted if name not in names]:
         raise ValueError(f"Missing band '{missing[0]}' in {label}. Has {names}.")
     return [names.index(name) for name in wanted]
 
@@ -504,8 +505,7 @@ def _check_coordinate(array: xr.DataArray, dim: str, label: str) -> None:
     if dim not in array.coords:
         raise ValueError(f"Missing coordinate '{dim}' of {label}. Must be given.")
     units = COORDINATES[dim].units
-    coordinate = check_numbers(array[dim], f"'{dim}' of {label}", units)
-    values = coordinate.values.astype(np.float64)
+    values = check_numbers(array[dim], f"'{dim}' of {label}", units).values.astype(np.float64)
     steps = np.diff(values)
     if not np.all(np.isfinite(values)):
         raise ValueError(f"Invalid '{dim}' of {label}: not finite. Must be finite.")

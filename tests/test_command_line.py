@@ -360,16 +360,8 @@ def test_blackbody_in_a_store(
     first, second = (store.open_dataset(results / f"response{n}.zarr") for n in ("", "2"))
     np.testing.assert_allclose(second["offset"], first["offset"], rtol=0, atol=1e-6)
     # What is known of the accuracy is stated, the rest is what is usual.
-    known = [
-        "--offset-std",
-        "0.2",
-        "0.3",
-        "--blackbody-accuracy",
-        "0.05",
-        "--room-temperature",
-        "25C",
-    ]
-    done(results, *names, *known, "-o", "accurate.zarr")
+    known = "--offset-std 0.2 0.3 --blackbody-accuracy 0.05 --room-temperature 25\N{DEGREE SIGN}C"
+    done(results, *names, *known.split(), "-o", "accurate.zarr")
     third = store.open_dataset(results / "accurate.zarr")
     assert third["offset_std"].values.tolist() == [0.2, 0.3]
     assert (float(third["blackbody_accuracy"]), float(third["room_temperature"])) == (0.05, 298.15)
@@ -409,9 +401,16 @@ def test_curves_films_pictures(results: Path) -> None:
         done(results, "export", "result.zarr", "-o", f"out.{suffix}")
     np.testing.assert_array_equal(tifffile.imread(results / "out.tif"), object_)
     np.testing.assert_array_equal(tifffile.imread(results / "out_status.tif"), status)
+    done(results, "export", "result.zarr", "--variable", "emissivity", "-o", "maps.tif")
+    with tifffile.TiffFile(results / "maps.tif") as stack:
+        assert json.loads(stack.pages.first.description)["band"] == ["8-14", "9.5"]
     with Image.open(results / "out.gif") as film:
         assert film.n_frames == FRAMES // 2  # type: ignore[attr-defined]
     assert (results / "out_status.png").read_bytes().startswith(b"\x89PNG")
+    for variable, first in {"uncertainty": "cause noise", "emissivity": "band 8-14"}.items():
+        drawn = done(results, "export", "result.zarr", "--variable", variable, "-o", f"{first}.svg")
+        assert drawn[f"{first}.svg"]["images"][0] == f"{variable}, {first}"
+        assert "\N{DEGREE SIGN}C" not in (results / f"{first}.svg").read_text("utf-8")
     (results / "out.tif").unlink()
     line = refused(results, "export", "result.zarr", "-o", "out.tif")
     assert "There is something at 'out_status.tif'" in line
@@ -419,6 +418,16 @@ def test_curves_films_pictures(results: Path) -> None:
         np.testing.assert_array_equal(opened["object_temperature"], object_)
         np.testing.assert_array_equal(opened["status"], result["status"])
     assert (results / "out.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_capture_is_exported_as_netcdf(results: Path) -> None:
+    """Counts from 32768 on, which the 16 bits of the format do not hold, are in it, too."""
+    scene = store.open_dataset(results / "scene.zarr")
+    store.save(scene.assign(counts=scene["counts"] | 32768), results / "bright.zarr", {})
+    done(results, "export", "bright.zarr", "-o", "bright.nc")
+    with xr.open_dataset(results / "bright.nc", engine="scipy") as opened:
+        np.testing.assert_array_equal(opened["counts"], scene["counts"] | 32768)
+        assert opened["counts"].attrs["units"] == "count"
 
 
 def test_curves_of_pixels_copy_no_film(results: Path) -> None:
@@ -451,6 +460,8 @@ def test_plan_and_data(tmp_path: Path) -> None:
     assert "Assumed: 35 s at 10 Hz; the object rises by 25 K" in out
     assert re.search(r"(?m)^plate window glass  9.5 +0\.706 +0\.173 ", out)
     assert re.search(r"(?m)^brass plate +none .*\n.*Best none: no filter", out)
+    still = done(tmp_path, "plan", "brass plate", "--noise", "0.03", "--span", "0")["numbers"]
+    assert None in still["brass plate"]["object_temperature_std_K"].values()  # JSON has no infinity
     listed = done(tmp_path, "data")
     assert listed["filters_um"]["9.5"] == [9.25, 9.75]
     assert listed["emissivity"]["plate window glass"]["9.5"] == 0.718
@@ -474,6 +485,9 @@ def test_nothing_is_overwritten(results: Path) -> None:
     assert "lies there. Must be another place" in line
     line = refused(results, "correct", "scene.zarr", "nuc.zarr", "-o", "scene.zarr/inner.zarr")
     assert "lies there. Must be another place" in line
+    (results / "foreign.zarr").write_text("notes")
+    wrong = ["correct", "nuc.zarr", "nuc.zarr", "--overwrite", "-o", "foreign.zarr"]
+    assert "Foreign file 'foreign.zarr'" in refused(results, *wrong)  # before any work
     twice = ["-o", "new.zarr", "--correction-output", "./new.zarr"]
     line = refused(results, "calibrate", "--blackbody", "scene.zarr", *twice)
     assert "Invalid output 'new.zarr': an input or another output lies there" in line
@@ -576,8 +590,9 @@ explore result.zarr nuc.zarr -o x.ipynb -> Invalid capture 'nuc.zarr' of stage '
 report result.zarr response.zarr aligned.zarr -o x.html -> Exchanged with the response
 report result.zarr -o x.pdf -> Invalid output 'x.pdf'. Must end in '.html'
 separate aligned.zarr response.zarr -o result2 -> Invalid output 'result2'. Must end in '.zarr'
-export aligned.zarr -o x.csv -> No variable with times and pixels in 'aligned.zarr'
+export aligned.zarr -o x.csv -> No variable with times .* in 'aligned.zarr'.* .*nc takes any store
 export result.zarr --variable emissivity -o x.csv -> 'emissivity' for .csv. Must be one of
+export result.zarr --variable bridged -o x.csv -> 'bridged' for .csv. Must be one of .'back
 export result.zarr --variable noise -o x.tif -> 'noise' for .tif. Must be one of
 separate aligned.zarr response.zarr --method calibrated --emissivity 1 -o x.zarr
  -> Must be one for each

@@ -72,6 +72,8 @@ TRANSFORM = xr.DataArray(
 )
 solve: Callable[..., xr.Dataset] = partial(separation.solve, CAPTURE, CAMERA)
 calibrated = partial(solve, method="calibrated")
+walked = partial(simulation.walkers, TIME, SHAPE, GLASS, RNG)
+fitted = partial(calibration.fit_response, CAMERA["counts"])
 completed = partial(separation.complete, RESULT, CAPTURE, CAMERA)
 Call = Callable[[], Any]
 Labelled = xr.DataArray | xr.Dataset
@@ -121,6 +123,9 @@ EMPTY = CAPTURE.isel(y=slice(0, 0))  # so that what is refused is refused before
 LABELS = xr.zeros_like(COUNTS[0, 0], dtype=int)
 STILL = recorded().isel(time=[0])
 FLAGGED = recorded().assign(frame_flags=("time", np.full(60, 65536)))
+COLD = STATISTICS.assign_coords(temperature=[2.0, 40.0, 70.0])
+DATES, PATCH = np.datetime64("2026-01-01", "ns") + np.arange(60), PIXELS.expand_dims("patch")
+NEGATIVE = RESULT.assign(object_temperature_std=-RESULT["object_temperature_std"])
 FALLING = CAPTURE.isel(time=[*range(40), 39, *range(40, 60)])
 TURNED = CAPTURE.transpose("time", "band", "y", "x")
 SETTINGS: list[tuple[Any, dict[str, Any], str]] = [
@@ -133,26 +138,19 @@ SETTINGS: list[tuple[Any, dict[str, Any], str]] = [
 ]
 CASES: list[tuple[Call, str]] = [
     (lambda: calibration.Bias(air_temperature=22.0), r"air_temperature \[K\] 22.0.*in kelvin"),
-    (
-        lambda: simulation.walkers(TIME, SHAPE, GLASS, RNG, temperatures=(22.0, 32.0, 60.0)),
-        "temperatures.*in kelvin",
-    ),
-    (
-        lambda: correction.fit_correction(STATISTICS.assign_coords(temperature=[2.0, 40.0, 70.0])),
-        "temperature.*in kelvin",
-    ),
+    (lambda: walked(temperatures=(22.0, 32.0, 60.0)), "temperatures.*in kelvin"),
+    (lambda: correction.fit_correction(COLD), "temperature.*in kelvin"),
+    (lambda: correction.Reference(CAMERA, PATCH, (22.0,)), r"temperatures \[K\] 22.0.*in kelvin"),
+    (lambda: limits.CaptureDesign(level=22.0), "level 22.0.*in kelvin"),
+    (lambda: fitted(room_temperature=22.0), "room_temperature of the response 22.0.*in kelvin"),
+    (lambda: limits.plan(TABLE.sel(band=["8-14"]), NOISE), "Missing band '8-14', or a second one"),
     (lambda: simulation.Background(level=22.0), r"level \[K\] 22.0.*in kelvin"),
     (lambda: simulation.Background(drift=np.nan), "drift"),
     (lambda: simulation.Rig(offset=np.nan), "offset"),
     (lambda: completed(surroundings=295.0, surroundings_std=True), "surroundings_std"),
     (lambda: completed(surroundings_std=1e-30), "surroundings_std"),
     (lambda: separation.separate(EMPTY, CAMERA, surroundings_std=1e-30), "surroundings_std"),
-    (
-        lambda: separation.complete(
-            RESULT.assign(object_temperature_std=-RESULT["object_temperature_std"]), CAPTURE, CAMERA
-        ),
-        "object_temperature_std.*negative",
-    ),
+    (lambda: separation.complete(NEGATIVE, CAPTURE, CAMERA), "object_temperature_std.*negative"),
     (lambda: streamed(np.datetime64("2024-01-01")), "time"),
     (lambda: streamed("0.1"), "time"),
     (lambda: streamed(0.1, segment=1.5), "segment"),
@@ -188,10 +186,7 @@ CASES: list[tuple[Call, str]] = [
         r"emissivity 1.2 in band '9.5', pixel \(0, 0\). Must lie in \(0, 1\)",
     ),
     (lambda: calibrated(emissivity=emissivity_of(0.8, 0.8)), "same in both bands. Must differ"),
-    (
-        lambda: calibrated(emissivity=0.9),
-        r"a DataArray of dims \('band',\) .* such as xr.DataArray",
-    ),
+    (lambda: calibrated(emissivity=0.9), r"DataArray of dims \('band',\) .* such as xr.DataArray"),
     *(
         (lambda drift=drift: separation.SubspaceSettings(drift), f"background_drift {drift} K")
         for drift in (-1.0, np.nan, np.inf)
@@ -208,6 +203,9 @@ CASES: list[tuple[Call, str]] = [
     (captured(segment=("time", np.arange(60)[::-1])), "do not fall"),
     (captured(segment=("x", np.arange(8))), "Must be .'time',"),
     (captured(segment=("time", np.arange(60))), "59 shutter events in 60 frames"),
+    (captured(time=("time", DATES)), "dtype datetime64.* of dates .time - time.0.. / np.timedelta"),
+    (captured(counts=COUNTS.astype(np.longdouble)), "Must be a real number of at most 64 bits"),
+    (captured(status=0.5 * LABELS), "dtype float64 .* mask, average or fill single variables"),
     (captured(counts=KELVIN), "units 'K' of 'counts' of the corrected. Must be 'count'"),
     (captured(status=(("x", "y"), np.zeros((8, 6), np.uint16))), "dims .'x', 'y'. of 'status'"),
     (captured(status=(("y", "x"), np.full(SHAPE, 2**21, np.uint32))), "Unknown bits 2097152"),
@@ -262,22 +260,10 @@ LAID: dict[str, tuple[Callable[[Any], Any], Labelled, str]] = {
         "y x band",
     ),
     "solve response": (lambda it: separation.solve(CAPTURE, it), CAMERA, "band"),
-    "materials": (
-        lambda it: separation.materials(it, CAPTURE, CAMERA),
-        RESULT,
-        "time y x band",
-    ),
-    "reflected_change": (
-        lambda it: reflected_change(it, RESULT),
-        APPARENT,
-        "time y x",
-    ),
+    "materials": (lambda it: separation.materials(it, CAPTURE, CAMERA), RESULT, "time y x band"),
+    "reflected_change": (lambda it: reflected_change(it, RESULT), APPARENT, "time y x"),
     "apparent": (lambda it: response.apparent_temperature(it, COUNTS), CAMERA, "band"),
-    "fit_response": (
-        lambda it: calibration.fit_response(CAMERA["counts"], it),
-        CAMERA["noise"],
-        "band",
-    ),
+    "fit_response": (fitted, CAMERA["noise"], "band"),
     "correct": (lambda it: correction.correct(EVEN, it), PLAIN, "y x band"),
     "renew_offset": (lambda it: correction.renew_offset(PLAIN, it), FLAT, "y x band"),
     "correct_capture flat": (

@@ -66,7 +66,7 @@ def finite(text: str) -> float:
 def kelvin(text: str) -> float:
     """Temperature [K] of a text with its unit; 273.15 as in scipy, whose import takes long."""
     try:
-        value, unit = finite(text[:-1]), text[-1:]
+        value, unit = finite(text[:-1].rstrip("\N{DEGREE SIGN} ")), text[-1:]
         temperature = round(value + {"C": 273.15, "K": 0.0}[unit], 9)
     except (KeyError, ArgumentTypeError) as error:
         rule = "Must be a number, with a decimal point, and its unit, such as 20.5C or 293.15K"
@@ -90,9 +90,8 @@ def sources_and_targets(options: Namespace) -> tuple[list[Path], list[Path]]:
     sources = [leaf for name, value in arguments for leaf in leaves(value) if is_source(name, leaf)]
     targets = [value for name, value in arguments if name.endswith(("output", "folder")) and value]
     end = {"explore": ".ipynb", "report": ".html", "export": ""}.get(options.command, ".zarr")
-    for path in sources:
-        if not path.exists():
-            raise FileNotFoundError(f"No file or folder '{path}'. Must exist.")
+    for path in (path for path in sources if not path.exists()):
+        raise FileNotFoundError(f"No file or folder '{path}'. Must exist.")
     taken = [source.resolve() for source in sources]
     for path in targets:
         place = path.resolve()

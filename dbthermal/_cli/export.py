@@ -15,6 +15,7 @@ from scipy.constants import zero_Celsius
 
 from dbthermal import explorer, schema, store
 from dbthermal._cli.files import ANIMATED, PICTURES, opened, provenance, staged
+from dbthermal.explorer._films import FILMS
 
 
 def export(options: argparse.Namespace) -> dict[str, Any]:
@@ -24,16 +25,17 @@ def export(options: argparse.Namespace) -> dict[str, Any]:
     options.variable, *further = options.variable or ["object_temperature"]
     if suffix not in _WRITERS:
         raise ValueError(f"Invalid output '{options.output}'. Must end in one of {[*_WRITERS]}.")
-    names = sorted(map(str, result.data_vars))
     if suffix != ".nc":  # pictures, or curves over time
         dims, last = (("y", "x"), 2) if suffix in (".tif", *PICTURES) else (("time", "y", "x"), 4)
-        names = [name for name in names if result[name].dims[-last:] == dims]
-        if not names:
-            rule = "Must be a result, as from: dbthermal separate"
+        missing = {*str(result.attrs.get("not_estimated", "")).split()}
+        missing |= {"bridged"} if last > len(dims) else set()  # no curve, nor a film to see
+        fitting = {str(name) for name in result if result[name].dims[-last:] == dims}
+        if not (names := sorted(fitting - missing)):
+            rule = "Must be a result, as from: dbthermal separate; *.nc takes any store"
             raise ValueError(f"No variable with times and pixels in '{options.result}'. {rule}.")
-    if further or options.variable not in names:
-        kind = f"variable '{' '.join([options.variable, *further])}' for {suffix}"
-        raise ValueError(f"Unknown {kind}. Must be one of {names}.")
+        if further or options.variable not in names:
+            kind = f"variable '{' '.join([options.variable, *further])}' for {suffix}"
+            raise ValueError(f"Unknown {kind}. Must be one of {names}.")
     # A film or picture has that of the status beside it.
     outputs = {options.output: options.variable}
     if suffix in (".tif", *PICTURES) and "status" in result and options.variable != "status":
@@ -97,6 +99,7 @@ def _film(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dict[s
     array = result[options.variable]
     about = {"variable": array.name, "units": array.attrs.get("units"), **provenance(options)}
     about |= schema.origin(result.attrs)
+    about |= {str(dim): array[dim].values.tolist() for dim in array.dims[:-2] if dim != "time"}
     values = array.values.astype(np.float32) if array.dtype.kind == "f" else array.values
     tifffile.imwrite(path, values, photometric="minisblack", description=json.dumps(about))
     return {"shape": list(values.shape), "dtype": str(values.dtype), "units": about["units"]}
@@ -104,40 +107,46 @@ def _film(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dict[s
 
 def _animation(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dict[str, Any]:
     """Animate a variable, in degrees Celsius if it is a temperature."""
-    from dbthermal.explorer import _export  # noqa: PLC0415 - optional
+    from dbthermal.explorer._export import Shown, save_film  # noqa: PLC0415 - optional
 
-    shown = _export.Shown([options.variable], 0, {}, celsius=True)
-    _export.save_film(explorer.View(result), path, shown)
+    save_film(explorer.View(result), path, Shown([options.variable], 0, {}, celsius=True))
     return {"bytes": path.stat().st_size}
 
 
 def _picture(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dict[str, Any]:
-    """Draw a variable at the last time, in degrees Celsius if it is a temperature."""
+    """Draw all bands or causes of a variable at the last time, a temperature in degrees Celsius."""
     from dbthermal import figures  # noqa: PLC0415 - optional
-    from dbthermal.figures import drawing  # noqa: PLC0415 - optional
 
     if options.variable == "status":
         store.save_figure(figures.status(result), path, provenance(options))
         return {"shape": list(result["status"].shape)}
     array = result[options.variable]
-    image = array.isel({dim: -1 for dim in array.dims if dim not in ("y", "x")})
-    unit, label = array.attrs.get("units", "1"), str(array.name).replace("_", " ")
-    if unit == "K" and not label.endswith(" std"):
-        image, unit = image - zero_Celsius, "\N{DEGREE SIGN}C"
-    figure, axes = drawing.canvas(1, 1, (6.4, 4.8))
-    drawing.draw_image(figure, axes[0, 0], image, label, f"{label} [{unit}]")
-    figure.suptitle(drawing.provenance_note(result).removeprefix(", "))
+    unit, label, titles = array.attrs.get("units", "1"), array.name.replace("_", " "), list[str]()
+    if array.name in FILMS:
+        array, unit = array - zero_Celsius, "\N{DEGREE SIGN}C"
+    moment = f", {array['time'][-1]:g} s" if "time" in array.dims else ""
+    array = array.isel(time=-1, missing_dims="ignore")
+    # A picture of each band, cause or axis.
+    dims, shape = array.dims[:-2], array.shape[:-2]
+    columns = next(number for number in (3, 2, 1) if math.prod(shape) % number == 0)
+    rows = math.prod(shape) // columns
+    figure, axes = figures.drawing.canvas(rows, columns, (2.2 + 4.2 * columns, 1.6 + 3.2 * rows))
+    for axis, place in zip(axes.ravel().tolist(), np.ndindex(*shape), strict=True):
+        at = [f", {dim} {array[dim].values[n]}" for dim, n in zip(dims, place, strict=True)]
+        titles.append("".join([label, moment, *at]))
+        figures.drawing.draw_image(figure, axis, array[place], titles[-1], f"{label} [{unit}]")
+    figure.suptitle(figures.drawing.provenance_note(result))
     store.save_figure(figure, path, provenance(options))
-    at = {str(k): str(v.values) for k, v in image.coords.items()}
-    return {"shape": list(image.shape), "at": at}
+    return {"shape": [*array.shape[-2:]], "images": titles}
 
 
 def _netcdf(result: xr.Dataset, path: Path, _: argparse.Namespace) -> dict[str, Any]:
     """Write everything in format 3, with what its attributes cannot hold as JSON."""
-    plain = result.drop_encoding()
+    short = [name for name in result if result[name].dtype == np.uint16]  # which it has not
+    plain = result.drop_encoding().assign({name: result[name].astype("i4") for name in short})
     for attrs in (plain.attrs, *(variable.attrs for variable in plain.variables.values())):
         for name, value in attrs.items():
-            if name == "warnings" or isinstance(value, dict | bool | None):
+            if not isinstance(value, str) and np.asarray(value).dtype.kind not in "fiu":
                 attrs[name] = json.dumps(value)
     plain.to_netcdf(path, engine="scipy")
     return {"variables": sorted(map(str, result.data_vars))}
@@ -175,9 +184,8 @@ def explore(options: argparse.Namespace) -> dict[str, Any]:
     notebook = {"cells": [cell], "metadata": {"kernelspec": kernel}, "nbformat": 4}
     with store.whole(options.output, ".ipynb") as draft:
         draft.write_text(json.dumps(notebook | {"nbformat_minor": 5}), encoding="utf-8")
-    install = ""
-    if any(find_spec(library) is None for library in ("anywidget", "jupyterlab")):
-        install = ", in a clone: python -m pip install '.[explorer]' jupyterlab; then"
+    lacks = any(find_spec(library) is None for library in ("anywidget", "jupyterlab"))
+    install = ", in a clone: python -m pip install '.[explorer]' jupyterlab; then" * lacks
     return {str(options.output): f"opened by{install}: jupyter lab {options.output}"}
 
 

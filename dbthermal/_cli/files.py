@@ -3,6 +3,7 @@
 import argparse
 import re
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from inspect import Parameter, signature
 from itertools import groupby
 from pathlib import Path
@@ -253,8 +254,7 @@ def _described(paths: list[Path], options: argparse.Namespace, camera: int) -> d
     except ValueError as error:
         if options.clock is not None or not re.match("Missing (--)?clock", str(error)):
             raise
-    options = argparse.Namespace(**{**vars(options), "clock": [1.0]})  # any
-    lines = _described(paths, options, camera)
+    lines = _described(paths, argparse.Namespace(**{**vars(options), "clock": [1.0]}), camera)
     lines = {name: value for name, value in lines.items() if name not in _BY_CLOCK}
     return lines | {"clock": "not in the file: state the frame rate by --clock"}
 
@@ -379,21 +379,16 @@ def stage_of(dataset: xr.Dataset) -> str:
         return "recording of one band"
     fitting = ["other"]
     for stage, variables in sorted(schema.STAGES.items(), key=lambda stage: len(stage[1])):
-        try:
+        with suppress(TypeError, ValueError):
             schema.check(dataset, stage)
-        except (TypeError, ValueError):
-            continue
-        raw = "counts" in variables and dataset["counts"].dtype.kind != "f"
-        if stage not in {"capture", "corrected"} or raw == (stage == "capture"):
-            fitting.append(stage)
+            raw = "counts" in variables and dataset["counts"].dtype.kind != "f"
+            if stage not in {"capture", "corrected"} or raw == (stage == "capture"):
+                fitting.append(stage)
     return fitting[-1]
 
 
 def _shifts(dataset: xr.Dataset) -> dict[str, Any]:
-    """Rows down and columns to the right by which views and reflections show a point elsewhere.
-
-    Of a view, for which there is a matrix for each band, the centre of the image.
-    """
+    """Rows down, columns right by which views, at their centre, and reflections lie elsewhere."""
     lines, views = dict[str, Any](), len(dataset.attrs.get("transform", ())) / 9
     if {"y", "x"} <= dataset.sizes.keys() and views and views == dataset.sizes.get("band"):
         column, row = (0.5 * (dataset.sizes[dim] - 1) for dim in ("x", "y"))

@@ -55,10 +55,8 @@ def _run(session: Session, folder: Path, *, dry: bool) -> int:
     if session.blackbody is None and path.exists() and not dry:
         raise FileExistsError(f"There is something at '{path}'. Must be a new recording.")
     # The devices, as emulated or as plugged in.
-    if session.simulated:
-        _say(f"Session '{session.name}': every device is emulated, nothing is measured.")
-    else:
-        _say(inventory.plugged_in(session))
+    emulated = f"Session '{session.name}': every device is emulated, nothing is measured."
+    _say(emulated if session.simulated else inventory.plugged_in(session))
     with open_devices(session) as devices:
         for name, identity in devices.identities().items():
             _say(f"{name}: " + ", ".join(f"{key} {value}" for key, value in identity.items()))

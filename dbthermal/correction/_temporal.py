@@ -183,8 +183,8 @@ class Reference:
     def __post_init__(self) -> None:
         schema.check(self.response, "response")
         schema.check_variable(self.patches, _PATCHES, "the patches")
-        shape = (self.patches.sizes["patch"],)
-        values = _numbers.real_numbers("temperatures [K]", self.temperatures, shape=shape)
+        kelvin, shape = _numbers.KELVIN, (self.patches.sizes["patch"],)
+        values = _numbers.real_numbers("temperatures [K]", self.temperatures, kelvin, shape)
         if len(values) > 1 and not np.ptp(values) > 0.0:
             raise ValueError(f"Invalid temperatures {values.tolist()} K of patches. Must differ.")
         _numbers.real_number("temperature_std [K]", self.temperature_std, _numbers.POSITIVE)

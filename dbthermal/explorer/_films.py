@@ -14,9 +14,9 @@ import xarray as xr
 from scipy.constants import zero_Celsius
 from scipy.special import chdtri
 
-from dbthermal import _rows, _text, schema, store
+from dbthermal import _numbers, _rows, _text, schema, store
 from dbthermal import response as responses
-from dbthermal._arrays import Array, Mask, empty, on_disk, release
+from dbthermal._arrays import Array, Mask, empty, on_disk, quotient, release
 from dbthermal._coordinates import laid_on
 
 Values = npt.NDArray[np.float32]
@@ -102,11 +102,9 @@ def opened(data: xr.Dataset | str | Path, label: str) -> xr.Dataset:
     """Dataset, opened if it is the path of a store."""
     if isinstance(data, str | Path):
         return store.open_dataset(data)
+    rule = "Must be a Dataset or the path of a store, as from separation.separate"
     if not isinstance(data, xr.Dataset):
-        raise TypeError(
-            f"Invalid {label} of type {type(data).__name__}. Must be a Dataset or the path of a "
-            "store, as from separation.separate."
-        )
+        raise TypeError(f"Invalid {label} of type {type(data).__name__}. {rule}.")
     return data
 
 
@@ -119,6 +117,9 @@ def result_panes(data: xr.Dataset) -> Iterator[Pane]:
     for name in (name for name in variables if name in data):
         schema.check_variable(data[name], variables[name], f"'{name}' of the result")
         laid_on(data[name], data["object_temperature"], f"'{name}'", "the object temperature")
+    film = data["object_temperature"]
+    if film.variable._in_memory and (first := float(film[0].median())) < _numbers.KELVIN[0]:
+        raise ValueError(f"Invalid object temperature {first:.1f}. Must be in kelvin, not Celsius.")
     # What is estimated, then its deviations: a film each, or a map a band.
     missing = str(data.attrs.get("not_estimated", "")).split()
     stds = [f"{name}_std" for name in (*FILMS, "emissivity") if name not in missing]
@@ -264,7 +265,7 @@ def common_gain(emissivity: Array, covariance: Array) -> Array:
         first, second = np.delete(inverse, -1, axis), np.delete(inverse, 0, axis)
         step = np.einsum("yxib,byx->iyx", first + second, np.diff(value, axis=1 + axis)) / 2.0
         total = np.delete(variance, -1, 1 + axis) + np.delete(variance, 0, 1 + axis)
-        ratios.append(np.reshape(step**2 / total, (2, -1)))
+        ratios.append(np.reshape(quotient(step**2, total, np.nan), (2, -1)))
     pairs = np.concatenate(ratios, axis=1)
     pairs = pairs[:, np.isfinite(pairs).all(axis=0)]
     residual_share = np.zeros(2)

@@ -243,8 +243,8 @@ class View:
         data, (rows, columns) = self.data, box
         displaced = data.attrs.get("reflection_shift", "none") != "none"
         displaced |= bool((self.status & int(Status.NO_REFLECTION_PAIR)).any())
-        needed = {*FILMS, "emissivity", "emissivity_std"}
-        if pane.name not in FILMS or displaced or not needed <= set(data):
+        estimated = {"emissivity", "emissivity_std"} <= set(data) and {*FILMS} <= set(self.panes)
+        if pane.name not in FILMS or displaced or not estimated:
             return None
         cut = data[[name for name in data if str(name).startswith("emissivity")]]
         cut = cut.isel(y=rows, x=columns)
@@ -276,8 +276,7 @@ class View:
         """Noise of the samples of a band, with what is left of its pattern; NaN if not known."""
         assert self.capture is not None
         holders = [holder for holder in (self.response, self.data) if holder is not None]
-        stated = [holder["noise"] for holder in holders if "noise" in holder]
-        if not stated:
+        if not (stated := [holder["noise"] for holder in holders if "noise" in holder]):
             return np.full(values.shape, np.nan)
         band = pane.name.removeprefix("input ")
 

@@ -55,10 +55,10 @@ class CaptureDesign:
     duration: float = 2.0
 
     def __post_init__(self) -> None:
-        for name in ("seconds", "rate", "start", "level", "period", "duration"):
-            _numbers.real_number(name, getattr(self, name), _numbers.POSITIVE)
-        for name in ("span", "amplitude"):
-            _numbers.real_number(name, getattr(self, name), (-schema.LARGEST, schema.LARGEST))
+        limits = dict.fromkeys(("start", "level"), _numbers.KELVIN)
+        limits |= dict.fromkeys(("span", "amplitude"), _numbers.FINITE)
+        for name, value in vars(self).items():
+            _numbers.real_number(name, value, limits.get(name, _numbers.POSITIVE))
         if self.duration > self.period:
             rule = f"Must be at most the period, {self.period} s"
             raise ValueError(f"Invalid duration {self.duration} s of a pulse. {rule}.")
@@ -131,8 +131,8 @@ def plan(
     beside = beside or ("10.6" if outdoors else "8-14")
     emissivity = _emissivities(table)
     names = [str(name) for name in table["band"].values]
-    if beside not in names:
-        raise ValueError(f"Missing band '{beside}' in the table. Has {names}.")
+    if beside not in names or len(names) < 2:
+        raise ValueError(f"Missing band '{beside}', or a second one, of {names}. Must be there.")
     # Combinations of filters beside the band that is always recorded.
     filters = [place for place, name in enumerate(names) if name != beside]
     together = _numbers.whole_number("together", together, (1, len(filters)))

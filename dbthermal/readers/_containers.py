@@ -105,8 +105,7 @@ def opened(path: Path, name: str | None, stack: ExitStack) -> tuple[Any, list[An
 
     What the libraries raise until the file is closed names it as damaged.
     """
-    kind = _formats.format_of(path)
-    if not kind:
+    if not (kind := _formats.format_of(path)):
         rule = "Must be .npy, .npz, HDF5, NetCDF, MATLAB or zarr"
         raise ValueError(f"Invalid '{path.name}': of no format, by its first bytes. {rule}.")
     stack.enter_context(_recording.damage_named(f"Damaged '{path.name}'", f"a whole {kind}"))

@@ -47,6 +47,7 @@ _FOREIGN: Final = {
 """What to do with a format that no reader opens, by suffix or first bytes."""
 _LARGEST: Final = 2**46  # of a file that is not read at once [byte]
 _TEXT: Final = 512  # bytes at the beginning of a file, without a control character
+_UTF16: Final = (b"\xff\xfe", b"\xfe\xff")  # marks at the beginning of a text
 
 
 def format_of(path: Path) -> str:
@@ -73,6 +74,7 @@ def refuse_text(path: Path) -> None:
         return
     with path.open("rb") as stream:
         start = stream.read(_TEXT)
+    start = start.replace(b"\0", b"" if start.startswith(_UTF16) else b"\0")
     if start and not re.search(rb"[^\t\r\n -~\x80-\xff]", start):
         raise ValueError(f"Refused '{path.name}', a text: {_FOREIGN['text']}.")
 
@@ -90,8 +92,7 @@ def reader_of(path: Path) -> str:
 def files(path: Paths, reader: str) -> list[Path]:
     """Regular files of a recording, in the order of time; ValueError by what to do instead."""
     listed = path if isinstance(path, list | tuple) else [path]
-    paths = [texts.as_path(file) for file in listed]
-    if not paths:
+    if not (paths := [texts.as_path(file) for file in listed]):
         raise ValueError("Empty list of files. Must name at least one.")
     numbers = [[int(digits) for digits in re.findall("[0-9]+", file.stem)] for file in paths]
     for before, after, file in zip(numbers, numbers[1:], paths[1:], strict=False):

@@ -185,7 +185,8 @@ def array_name(names: Collection[str], name: str | None, path: Path, shapes: Seq
     if name in [*names]:
         return str(name)
     if not names:
-        rule = "Must have one: save each band by itself; a store of dbthermal is a capture as it is"
+        rule = "Must have one: stack images, squeeze axes of length 1, save each band by itself; "
+        rule += "a store of dbthermal is a capture as it is"
         label = f"'{path.name}', which has {', '.join(shapes[:3]) or 'none'}"
         raise ValueError(f"Missing array (time, y, x) in {label}. {rule}.")
     wanted = "name of one of the arrays (--variable)" if name is None else f"array '{name}'"
@@ -250,11 +251,8 @@ def stamps(clock: Clock | None, frames: int, name: str) -> Array:
         if not 0 < values <= _FASTEST:
             raise ValueError(f"Invalid clock {values} of '{name}'. {rule}.")
         return np.arange(frames) / float(values)
-    if (
-        values.shape != (frames,)
-        or not np.all(np.isfinite(values))
-        or (0 < np.ptp(values) * _FASTEST < frames - 1)
-    ):
+    fits = values.shape == (frames,) and np.isfinite(values).all()
+    if not fits or 0 < np.ptp(values) * _FASTEST < frames - 1:
         label = f"clock of shape {values.shape} for {frames} frames of '{name}'"
         raise ValueError(f"Invalid {label}. {rule}.")
     return np.asarray(values - values[0])

@@ -287,11 +287,11 @@ def test_emissivity_needs_noise(two_bands: xr.Dataset, measured: xr.Dataset) -> 
 test_impossible_accuracy_is_refused = refused(
     lambda stated: calibration.fit_response(blackbody(), **stated),
     [
-        ({"offset_std": -0.1}, "Invalid offset_std [-0.1, -0.1] of the response. Must lie in"),
-        ({"gain_std": (0.01, np.nan)}, "Invalid gain_std [0.01, nan] of the response"),
+        ({"offset_std": -0.1}, "Invalid offset_std of the response -0.1. Must lie in"),
+        ({"gain_std": (0.01, np.nan)}, "Invalid gain_std of the response nan"),
         ({"pattern_std": (0.1, 0.1, 0.1)}, "Invalid pattern_std of shape (3,)"),
-        ({"blackbody_emissivity": 1.1}, "Invalid blackbody_emissivity 1.1 of the response"),
-        ({"blackbody_accuracy": -1.0}, "Invalid blackbody_accuracy -1.0 of the response"),
+        ({"blackbody_emissivity": 1.1}, "Invalid blackbody_emissivity of the response 1.1"),
+        ({"blackbody_accuracy": -1.0}, "Invalid blackbody_accuracy of the response -1.0"),
     ],
 )
 

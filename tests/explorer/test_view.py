@@ -49,6 +49,12 @@ def test_panes_of_a_result_with_its_capture(glass: Glass) -> None:
     assert "emissivity" in result.attrs["not_estimated"].split()
     assert {"input 8-14", "input 9.5", "object_temperature", "status"} <= set(view.panes)
     assert not [name for name in view.panes if name.startswith("emissivity")]
+    mean = result["object_temperature"].isel(time=0).where(result["status"] == 0).mean()
+    curve = view.curve("object_temperature", WHOLE, pixels="measured")
+    np.testing.assert_allclose(curve["mean"][0], mean, rtol=1e-6)
+    stated = {"emissivity": xr.DataArray([0.86, 0.72], dims="band")}  # without a deviation
+    result = dbthermal.separation.solve(capture, response, "calibrated", **stated)
+    assert View(result).curve("object_temperature", WHOLE)["std"].notnull().all()
     apparent = apparent_temperature(response, capture["counts"].isel(time=[7]))
     np.testing.assert_allclose(view.frame("input 9.5", 7), apparent[1, 0], rtol=0, atol=5e-5)  # [K]
 
@@ -274,6 +280,7 @@ OTHER: list[tuple[Any, str]] = [
     (3, "Invalid data of type int. Must be a Dataset or the path of a store"),
     (xr.Dataset({"a": ("x", [1.0])}), "Missing variable 'object_temperature'"),
     (separated().drop_vars("time"), "Missing coordinate 'time'"),
+    (separated(object_temperature=np.full((3, 4, 5), 22.0)), "Must be in kelvin, not Celsius"),
     (separated().isel(time=0), "Invalid dims"),
     (separated().isel(time=[]), "Empty 'object_temperature'"),
     (separated().assign_coords(time=[0.0, 0.0, 1.0]), "Unordered 'time'"),

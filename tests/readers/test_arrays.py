@@ -58,7 +58,7 @@ def test_times_of_npz_and_arrays_of_other_libraries(tmp_path: Path) -> None:
         read(
             pytest.importorskip("torch").zeros((3, 4, 5), dtype=pytest.importorskip("torch").int32)
         )
-    with pytest.raises(ValueError, match=r"which has frames \(1, 3, 24, 32\)\. Must have one"):
+    with pytest.raises(ValueError, match=r"frames \(1, 3, 24, 32\)\. .* squeeze axes"):
         read(hdf5(tmp_path / "b.h5", scene()[np.newaxis]))
 
 
@@ -90,10 +90,7 @@ MILLISECONDS = xr.DataArray(100.0 * np.arange(3), dims="time", attrs={"units": "
         (scene()[0], {}, r"Invalid shape \(24, 32\) of 'array'"),
         (scene()[:0], {}, r"Invalid shape \(0, 24, 32\) of .*Must be \(time, y, x\), not 0"),
         (scene().tolist(), {}, "Invalid dtype int64 of 'array'"),
-        *(
-            (scene(), {"memory": m}, "memory.*Must be (a number|finite)")
-            for m in ("1e9", np.nan, True)
-        ),
+        *((scene(), {"memory": it}, "memory.*Must be (a n|fin)") for it in ("1e9", np.nan, True)),
         (scene(), {"unit": ["count"]}, "unit.*Must be 'count'"),
         (scene(), {"clock": None}, "Missing clock= for 'array', which tells no times"),
         *(

@@ -82,10 +82,10 @@ def test_foreign_formats_are_named(tmp_path: Path) -> None:
 def test_texts_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
     """A table, a page of a server or a pointer to a file is a text, whatever its name."""
     for content in ("21,5;21,6\n" * 9, "<!DOCTYPE html><html>", "version https://git-lfs\n"):
-        (tmp_path / name).write_text(content)
-        status, text = info(capsys, tmp_path / name)
-        assert status == 1
-        assert f"Refused '{name}', a text" in text
+        for encoding in ("utf-8", "utf-8-sig", "utf-16"):
+            (tmp_path / name).write_text(content, encoding=encoding)
+            status, text = info(capsys, tmp_path / name)
+            assert (status, f"Refused '{name}', a text" in text) == (1, True)
 
 
 def test_zarr_of_other_programs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
