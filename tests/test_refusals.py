@@ -262,16 +262,8 @@ LAID: dict[str, tuple[Callable[[Any], Any], Labelled, str]] = {
         "y x band",
     ),
     "solve response": (lambda it: separation.solve(CAPTURE, it), CAMERA, "band"),
-    "materials": (
-        lambda it: separation.materials(it, CAPTURE, CAMERA),
-        RESULT,
-        "time y x band",
-    ),
-    "reflected_change": (
-        lambda it: reflected_change(it, RESULT),
-        APPARENT,
-        "time y x",
-    ),
+    "materials": (lambda it: separation.materials(it, CAPTURE, CAMERA), RESULT, "time y x band"),
+    "reflected_change": (lambda it: reflected_change(it, RESULT), APPARENT, "time y x"),
     "apparent": (lambda it: response.apparent_temperature(it, COUNTS), CAMERA, "band"),
     "fit_response": (
         lambda it: calibration.fit_response(CAMERA["counts"], it),

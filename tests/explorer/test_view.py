@@ -201,10 +201,7 @@ def test_exported_files(tmp_path: Path) -> None:
     chosen = {"pixels": "unflagged", "panes": names, "index": 1, "celsius": True}
     shown = {"kind": "export", **chosen, "palette": "inferno", "limits": {}}
     assert "without a region" in answer(explorer, **shown, suffix=".csv")[0]["error"]
-    regions = [
-        ("region 1", WHOLE.kind, WHOLE.points),
-        ("door", "rectangle", ((0, 0), (2, 2))),
-    ]
+    regions = [("region 1", WHOLE.kind, WHOLE.points), ("door", "rectangle", ((0, 0), (2, 2)))]
     answer(explorer, kind="curves", pane=names[0], pixels="unflagged", regions=regions)
     for suffix in (".csv", ".tiff", ".png", ".nc"):
         (tmp_path / f"a{suffix}").write_bytes(answer(explorer, **shown, suffix=suffix)[1][0])

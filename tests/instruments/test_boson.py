@@ -147,12 +147,7 @@ ENDLESS: list[Pair] = [(SERIAL_REQUEST, [bytes(4096)] * (boson.MAXIMUM_RECEIVED 
         (SERIAL, MUTE, BosonTimeoutError, "No reply to 'serial number' within 1 s"),
         (SERIAL, ENDLESS, BosonError, "within 65536 bytes"),
         (SERIAL, reply(1, FPA, b"\x01\x7c"), BosonError, "Must be of command 0x00050002"),
-        (
-            SERIAL,
-            reply(1, SERIAL, b"\0\1"),
-            BosonError,
-            "of 2 bytes to .* Must have 4",
-        ),
+        (SERIAL, reply(1, SERIAL, b"\0\1"), BosonError, "of 2 bytes to .* Must have 4"),
         (SERIAL, reply(1, SERIAL, status=0x283), BosonError, "0x283, camera busy"),
         (SERIAL, reply(1, SERIAL, status=0x6A4), BosonError, "0x6A4, flash"),
         (SERIAL, reply(1, SERIAL, status=0x999), BosonError, "0x999, unknown"),

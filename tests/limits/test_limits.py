@@ -393,13 +393,7 @@ def test_bad_plan_is_a_clear_error(
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("duration", 6.0),
-        ("seconds", 0.1),
-        ("seconds", 1e9),
-        ("span", "25"),
-    ],
+    ("name", "value"), [("duration", 6.0), ("seconds", 0.1), ("seconds", 1e9), ("span", "25")]
 )
 def test_bad_design_is_a_clear_error(name: str, value: Any) -> None:
     """Invalid capture conditions raise an error with the rule."""
