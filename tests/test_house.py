@@ -71,5 +71,4 @@ def test_names_are_nouns() -> None:
         if isinstance(node, ast.Name)
     ]
     share = sum(name in PRONOUNS for name in names) / len(names)
-    print(f"pronouns: {share:.2%} of {len(names)} names")
     assert share <= MOST

@@ -53,16 +53,13 @@ def measured(of: xr.Dataset, warm: float, foil: float, number: int = 1) -> xr.Da
     return xr.Dataset(labelled | read, {"band": of["band"].values})
 
 
-def test_exact_without_errors(known: xr.Dataset) -> None:
-    """Exact signals give the exact emissivity, from one measurement too."""
+def test_deviation_is_the_standards_formula(known: xr.Dataset) -> None:
+    """One exact measurement gives the exact emissivity, and its deviation is
+    sqrt(W^2 + e^2 Wo^2 + (1-e)^2 Wr^2) / |Wo - Wr|.
+    """
     found = calibration.reflector_emissivity(measured(known, 325.0, 295.0), known, STDS)
     np.testing.assert_allclose(found["emissivity"], TRUE, rtol=0, atol=1e-12)
     assert np.all(np.isnan(found["reduced_chi2"]))
-
-
-def test_deviation_is_the_standards_formula(known: xr.Dataset) -> None:
-    """One measurement's deviation: sqrt(W^2 + e^2 Wo^2 + (1-e)^2 Wr^2) / |Wo - Wr|."""
-    found = calibration.reflector_emissivity(measured(known, 325.0, 295.0), known, STDS)
     curve = response.curve(known, "9.5")
     noise, share = float(known["noise"].sel(band="9.5")), TRUE[1]
     of_object = float(curve.count_slope(325.0)) * STDS[0]

@@ -387,7 +387,6 @@ def test_holes_do_not_hide_bad_pixels(kind: str) -> None:
     assert found[0].attrs["unjudged_pixels"] == np.count_nonzero(~judged)
     false, marked = ((part["status"].values & DEAD != 0)[judged] for part in found)
     bad = spoiled["spoiled"].max("band").values[judged] > 0
-    print(f"{kind} NaN: {false.mean():.1e} false alarms, {marked[bad].mean():.3f} found")
     assert false.mean() < 3e-3
     assert marked[bad].mean() > 0.85
 

@@ -47,7 +47,6 @@ def test_random_starts_find_the_emissivities(noise: tuple[float, float], pixels:
     scene, capture, response = glass(noise, pixels)
     result = separation.solve(capture, response, METHOD, seed=3)
     of_emissivity, of_object = errors(scene, result)
-    print(f"{noise}: emissivity {of_emissivity:.4f}, object {of_object:.3f} K")
     assert of_emissivity < 0.02
     assert of_object < 0.3
     assert float((result["status"] == 0).mean()) > 0.9
@@ -61,7 +60,6 @@ def test_a_start_at_the_separator_is_as_good_as_random_ones() -> None:
     start = DbvtSettings(start="subspace")
     started = separation.solve(capture, response, METHOD, settings=start, seed=3)
     of_random, of_started = errors(scene, random), errors(scene, started)
-    print(f"random {of_random}, started {of_started}")
     assert np.all(np.array(of_started) <= 1.1 * np.array(of_random))
     assert bool(started["emissivity"].notnull().all())
 
