@@ -1,14 +1,16 @@
-"""Experiments: scores of results with known errors, and scenes of a case that are as described."""
+"""Experiments: scenes of a case are as described; limits and nuisances have known numbers."""
 
-import re
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 import xarray as xr
+from refused import refused
 
 from dbthermal import response as responses
 from dbthermal.simulation import Rig
+from reproduction.experiments import limits, nuisances
 from reproduction.experiments.cases import simulate
 
 TIME = np.arange(350) / 10.0  # s
@@ -70,22 +72,43 @@ def test_bands_apart(offset: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"start": None}, r"Must have \['emissivity', 'start', 'stop'\]"),
-        ({"offset": 0.33}, r"Invalid offset 0.33 frames. Must be zero or positive, a multiple"),
-        ({"offset": -1.0}, r"Invalid offset -1.0 frames. Must be zero or positive"),
-        ({"frames": 351}, r"Invalid number of frames 351. Must lie in \[2, 350\]"),
-        ({"jump": {"between": [5.0, 4.0]}}, r"Invalid between \[5.0, 4.0\] s of a jump"),
-        ({"jump": {"duration": -1.0}}, r"Invalid duration -1.0 s of a jump"),
-        ({"emisivity": [0.9, 0.8]}, re.escape("with keys ['case', 'emisivity', 'emissivity',")),
-    ],
+    ("moved", "right", "bleeding"), [(0, 1.0, 0), (2, 1.0, 0), (5, 1 - 3 / 36, 1), (None, 0.0, 0)]
 )
-def test_values_of_a_case(change: dict[str, Any], message: str) -> None:
-    """Invalid, unknown and missing values, and bands apart on uneven times, are errors."""
-    case = {key: value for key, value in (GLASS | change).items() if value is not None}
-    with pytest.raises(ValueError, match=message):
-        simulate(case, Rig(), TIME, 20, seed=4)
-    uneven = np.append(TIME[:-1], TIME[-1] + 0.05)
-    with pytest.raises(ValueError, match="Invalid times of bands that are exposed apart"):
-        simulate(GLASS | {"offset": 1.0}, Rig(), uneven, 5, 0)
+def test_border_is_judged_beyond_two_pixels(moved: int | None, right: float, bleeding: int) -> None:
+    """A border two pixels off is kept; five off, three columns of 36 bleed; without labels 0."""
+    columns = xr.DataArray(np.indices((10, 40))[1], dims=("y", "x"))
+    labels = columns * 0 - 1 if moved is None else (columns >= 20 + moved).astype(int)
+    kept = limits.border_kept(labels, (columns >= 20).astype(int))
+    assert float(kept["right"]) == pytest.approx(right, abs=1e-12)
+    assert int(kept["bleeding"]) == bleeding
+
+
+def made(**changes: Any) -> Callable[[], object]:
+    """A case of glass with changes, or without the keys that are None."""
+    case = {key: value for key, value in (GLASS | changes).items() if value is not None}
+    return lambda: simulate(case, Rig(), TIME, 20, seed=4)
+
+
+UNEVEN = np.append(TIME[:-1], TIME[-1] + 0.05)
+VIEWS: dict[str, Any] = {"shape": [24, 32], "clock": [50, 10.0], "seed": 1}
+POOLED: dict[str, Any] = {"pixels": 400, "seed": 1, "ends": [20.0, 45.0], "clock": [350, 10.0]}
+
+
+test_experiments_that_cannot_be_made = refused(
+    lambda call: call(),
+    [
+        (made(start=None), "Must have ['emissivity', 'start', 'stop']"),
+        (made(offset=0.33), "Invalid offset 0.33 frames. Must be zero or positive, a multiple"),
+        (made(offset=-1.0), "Invalid offset -1.0 frames. Must be zero or positive"),
+        (made(frames=351), "Invalid number of frames 351. Must lie in [2, 350]"),
+        (made(jump={"between": [5.0, 4.0]}), "Invalid between [5.0, 4.0] s of a jump"),
+        (made(jump={"duration": -1.0}), "Invalid duration -1.0 s of a jump"),
+        (made(emisivity=[0.9, 0.8]), "with keys ['case', 'emisivity', 'emissivity',"),
+        (lambda: simulate(GLASS | {"offset": 1.0}, Rig(), UNEVEN, 5, 0), "are exposed apart"),
+        (lambda: limits.pooled([3], [0.86, 0.72], **POOLED), "Invalid size 3 of a group. Must div"),
+        (lambda: nuisances.disturbed("rain", pixels={}, nuisance={}, seed=1), "nuisance 'rain'"),
+        (lambda: nuisances.parallax(0.1, shift=[0.0, 0.0], **VIEWS), "multiples of 1/4 along x"),
+        (lambda: nuisances.parallax(1.0, shift=[12.0, 0.0], **VIEWS), "within 12 together"),
+    ],
+    error=ValueError,
+)
