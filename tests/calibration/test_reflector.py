@@ -209,21 +209,24 @@ def test_no_convergence_is_an_error(known: xr.Dataset, monkeypatch: pytest.Monke
         calibration.fit_emissivity(series, known, STDS)
 
 
-test_bad_bias = refused(
-    lambda options: Bias(**options),
+COLD = Bench(object_temperatures=(300.0,))
+
+
+test_bad_bias_and_bench = refused(
+    lambda known, call: call(known),
     [
-        ({"object_tolerance": -0.5}, r"Invalid object_tolerance \[K\] -0.5. Must lie in \[0.0, "),
-        ({"contact": (0.05, 0.0)}, r"Invalid contact \(0.05, 0.0\). Must be a range"),
-        ({"stray": (0.0, 1.0)}, r"Invalid stray \(0.0, 1.0\). Must be a range"),
-        ({"air_temperature": -20.0}, r"Invalid air_temperature \[K\] -20.0"),
+        (lambda _: Bias(object_tolerance=-0.5), "object_tolerance [K] -0.5. Must lie in [0.0, "),
+        (lambda _: Bias(contact=(0.05, 0.0)), "Invalid contact (0.05, 0.0). Must be a range"),
+        (lambda _: Bias(stray=(0.0, 1.0)), "Invalid stray (0.0, 1.0). Must be a range"),
+        (lambda _: Bias(air_temperature=-20.0), "Invalid air_temperature [K] -20.0"),
+        (
+            lambda it: reflector_series(it, OBJECTS[0], COLD, np.random.default_rng(0)),
+            "One must be 10.0 K above the air's 295.15 K",
+        ),
+        (
+            lambda it: compare_procedures(it, np.random.default_rng(0), repeats=1),
+            "Invalid comparison of 5 samples, 1 times",
+        ),
     ],
+    "known",
 )
-
-
-def test_bad_bench(known: xr.Dataset) -> None:
-    """Too cold an object, and too few repeats, raise a ValueError."""
-    cold = Bench(object_temperatures=(300.0,))
-    with pytest.raises(ValueError, match=r"One must be 10\.0 K above the air's 295\.15 K"):
-        reflector_series(known, OBJECTS[0], cold, np.random.default_rng(0))
-    with pytest.raises(ValueError, match="Invalid comparison of 5 samples, 1 times"):
-        compare_procedures(known, np.random.default_rng(0), repeats=1)
