@@ -265,7 +265,7 @@ def test_lag_of_marked_frames() -> None:
 
 
 DEAD = schema.Status.DEAD_PIXEL
-THRESHOLDS: tuple[object, ...] = (0, "6", True, [6.0], np.inf)
+THRESHOLDS: tuple[Any, ...] = (0, "6", True, [6.0], np.inf)
 
 
 @pytest.mark.parametrize("seed", range(2))

@@ -246,6 +246,7 @@ BAD_TIMES: list[Any] = [[0.0], [0.0, 0.0], [0.0, np.nan, 2.0], [[0.0, 1.0]]]
 INCREASE = "Must be (two or more|finite, and increase)"
 SCENE, PLAIN = partial(simulation.scene, np.arange(4.0)), np.full((4, 1, 1), 300.0)
 WHOLE = still().astype(np.uint16)  # of which a lagging pixel of 1000 would wrap to 57,580
+TEXT: Any = "40"
 NARROW = partial(disturbances.fire_shutter, bands=("10.6",))
 
 
@@ -260,7 +261,7 @@ test_what_is_refused = refused(
         (partial(Rig, noise=(0.03, 0.0)), "Invalid noise [K] 0.0. Must be finite and positive"),
         (partial(Rig, bad_fraction=1.0), "Invalid bad_fraction 1.0. Must lie in [0, 1)"),
         (partial(Rig, gain_std=np.nan), "Invalid gain_std nan"),
-        (partial(Rig, offset_std="40"), "Invalid offset_std '40'"),
+        (partial(Rig, offset_std=TEXT), "Invalid offset_std '40'"),
         (SCENE, -PLAIN, PLAIN, GLASS, "Invalid object_temperature [K] -300"),
         (SCENE, PLAIN, np.nan * PLAIN, GLASS, "Invalid background_temperature [K] nan"),
         (SCENE, PLAIN, PLAIN, 100.0 * GLASS, "Invalid emissivity 86"),
