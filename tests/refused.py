@@ -9,7 +9,12 @@ import pytest
 REFUSALS = (KeyError, TypeError, ValueError)
 
 
-def refused(call: Callable[..., Any], rows: Iterable[Sequence[Any]], fixtures: str = "") -> Any:
+def refused(
+    call: Callable[..., Any],
+    rows: Iterable[Sequence[Any]],
+    fixtures: str = "",
+    error: type[Exception] | tuple[type[Exception], ...] = REFUSALS,
+) -> Any:
     """Test of a function that raises an error for the arguments of each row.
 
     The last entry of a row is a part of the error's message, or a pattern of it. The function takes
@@ -20,7 +25,7 @@ def refused(call: Callable[..., Any], rows: Iterable[Sequence[Any]], fixtures: s
     def test(row: Sequence[Any], request: pytest.FixtureRequest) -> None:
         *arguments, message = row
         values = [request.getfixturevalue(name) for name in fixtures.split()]
-        with pytest.raises(REFUSALS) as caught:
+        with pytest.raises(error) as caught:
             call(*values, *arguments)
         text = str(caught.value)
         assert message in text or re.search(message, text), text

@@ -1,21 +1,21 @@
 """Band emissivities and the choice of a filter: closed forms, then the public libraries."""
 
-import re
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
+from refused import refused
 from scipy.integrate import quad
 
 from dbthermal import emissivity, planck, readers, schema
 from dbthermal.bands import FILTERS, Band
 from reproduction import libraries
 from reproduction.filters import condition_numbers, pair_summary, rank_filters
-
-GLASS = "manmade.generalconstructionmaterial.glas.solid.all.0796uuugls.jhu.becknic.spectrum.txt"
 
 
 def spectrum(wavelength_um: object, values: object) -> xr.Dataset:
@@ -135,12 +135,8 @@ BAD: list[tuple[dict[str, object], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("change", "message"), BAD)
-def test_bad_arguments(change: dict[str, object], message: str) -> None:
-    """Invalid arguments raise an error with the rule."""
-    arguments: dict[str, object] = {"spectra": {"m": spectrum([8, 14], [1, 1])}, "bands": FILTERS}
-    with pytest.raises((ValueError, KeyError, TypeError), match=re.escape(message)):
-        emissivity.band_table(**(arguments | change))  # type: ignore[arg-type]
+WHOLE: dict[str, Any] = {"spectra": {"m": spectrum([8, 14], [1, 1])}, "bands": FILTERS}
+test_bad_arguments = refused(lambda change: emissivity.band_table(**(WHOLE | change)), BAD)
 
 
 def test_pair_summary_leaves_gray_out_of_the_mean() -> None:
@@ -160,8 +156,6 @@ def test_noise_behind_filters() -> None:
     expected = [0.03, 0.279, 0.299, 0.113, 0.420]  # from the integral of dL/dT over each band
     np.testing.assert_allclose(noise, expected, rtol=0, atol=0.0005)
     assert noise.attrs["units"] == "K"
-    with pytest.raises(ValueError, match=re.escape("Invalid noise [K] -0.03")):
-        emissivity.filter_noise(-0.03, FILTERS)
 
 
 def test_single_frame_std() -> None:
@@ -192,29 +186,25 @@ def noise_of(*values: float, units: str = "K") -> xr.DataArray:
     return xr.DataArray(list(values), names, dims="band", attrs={"units": units})
 
 
-@pytest.mark.parametrize(
-    ("row", "noise", "more", "message"),
+GLASSY, PERCENT = table(glass=[0.86, 0.72]), table(glass=[86.0, 72.0])
+
+
+test_tables_that_rank_no_filter = refused(
+    lambda call, *arguments: call(*arguments),
     [
-        ([0.86, 0.72], noise_of(0.03), {}, "Missing band '9.5' in the noise"),
-        ([0.86, 0.72], noise_of(0.03, 0.0), {}, "Invalid noise [K] 0.0"),
-        ([0.86, 0.72], noise_of(0.03, np.nan), {}, "Invalid noise [K] nan"),
-        ([0.86, 0.72], noise_of(3.0, 3.0, units="count"), {}, "Invalid units 'count' of the noise"),
-        ([86.0, 72.0], noise_of(0.03, 0.03), {}, "Invalid emissivity of the table 86"),
-        ([0.86, 0.72], noise_of(0.03, 0.03), {"beside": "10.6"}, "Must hold '10.6'"),
+        (rank_filters, GLASSY, noise_of(0.03), "Missing band '9.5' in the noise"),
+        (rank_filters, GLASSY, noise_of(0.03, 0.0), "Invalid noise [K] 0.0"),
+        (rank_filters, GLASSY, noise_of(0.03, np.nan), "Invalid noise [K] nan"),
+        (rank_filters, GLASSY, noise_of(3.0, 3.0, units="count"), "units 'count' of the noise"),
+        (rank_filters, PERCENT, noise_of(0.03, 0.03), "Invalid emissivity of the table 86"),
+        (partial(rank_filters, beside="10.6"), GLASSY, noise_of(0.03, 0.03), "Must hold '10.6'"),
+        (condition_numbers, table(m=[0.9]), "Must be at least two"),
+        (pair_summary, np.ones(3), "Invalid condition numbers of type ndarray"),
+        (emissivity.filter_noise, -0.03, FILTERS, "Invalid noise [K] -0.03"),
+        (emissivity.filter_noise, "0.03", ["8-14"], "Invalid noise [K] '0.03'"),
+        (emissivity.library_mixture, ["x"], "Invalid bands ['x'] of the library's emissivities"),
     ],
 )
-def test_tables_that_rank_no_filter(
-    row: list[float], noise: xr.DataArray, more: dict[str, str], message: str
-) -> None:
-    """Noise that is no positive kelvin of every band, per cent and an absent band are refused."""
-    with pytest.raises(ValueError, match=re.escape(message)):
-        rank_filters(table(glass=row), noise, **more)
-    with pytest.raises(ValueError, match="Must be at least two"):
-        condition_numbers(table(m=[0.9]))
-    with pytest.raises(TypeError, match="Invalid condition numbers of type ndarray"):
-        pair_summary(np.ones(3))  # type: ignore[arg-type]
-    with pytest.raises(TypeError, match=r"Invalid noise \[K\] '0.03'"):
-        emissivity.filter_noise("0.03", ["8-14"])  # type: ignore[arg-type]
 
 
 def test_embedded_table_is_whole() -> None:
@@ -250,8 +240,6 @@ def test_library_mixture_is_a_distribution() -> None:
     assert np.linalg.eigvalsh(mixture["covariance"]).min() > 0
     other = emissivity.library_mixture(["8-14", "9.5"]).sel(band=["9.5", "8-14"])
     np.testing.assert_array_equal(mixture["mean"], other["mean"])
-    with pytest.raises(ValueError, match=r"Invalid bands \['x'\] of the library's emissivities"):
-        emissivity.library_mixture(["x"])
 
 
 @pytest.mark.data
@@ -272,12 +260,10 @@ def test_library_mixture_has_the_moments_of_the_libraries(spectra: dict[str, xr.
 def test_every_spectrum_of_the_libraries(spectra: dict[str, xr.Dataset]) -> None:
     """All 993 spectra make a table; 224 of them differ by more than 0.05 between the two bands.
 
-    Only six hold values outside [0, 1]. Plate window glass: 0.861 over 8-14 um, 0.718 at 9.5 um.
+    Only six hold values outside [0, 1].
     """
     assert sum(one.attrs["unphysical_values"] > 0 for one in spectra.values()) == 6
     assert min(float(one["wavelength"][-1]) for one in spectra.values()) > 12.39e-6
-    glass = emissivity.band_table({"glass": spectra[GLASS]}, ["8-14", "9.5"])["emissivity"]
-    np.testing.assert_allclose(glass[0], [0.861, 0.718], rtol=0, atol=0.002)
     made = emissivity.band_table(spectra, FILTERS, minimum_coverage=0.7)
     short = made["coverage"].sel(band="8-14") < emissivity.MINIMUM_COVERAGE
     difference = made["emissivity"].sel(band="8-14") - made["emissivity"].sel(band="9.5")

@@ -166,6 +166,8 @@ CASES: list[tuple[Call, str]] = [
     (lambda: alignment.align(CAPTURE, offset=0.0, reflection_shift=cast(Any, 3)), "shift"),
     (lambda: alignment.align(RAW, offset=0.0), "correct_capture, of a camera that corrects itself"),
     (lambda: correction.correct_capture(RAW, CORRECTION, shutter=NOTHING), "shutter"),
+    (lambda: correction.correct_capture(RAW, NOTHING), "Invalid correction of type NoneType"),
+    (lambda: correction.correct_capture(NOTHING, CORRECTION), "Invalid capture of type NoneType"),
     (lambda: whole(target="all.nc"), r"Must end in '\.zarr'"),
     (lambda: whole(correcting=None), "correct_capture.*mapping"),
     (lambda: whole(aligning={"ofset": 0.0}), "ofset.*offset"),

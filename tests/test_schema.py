@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from refused import refused
 
 from dbthermal import schema, store
 from dbthermal.schema import Status
@@ -57,8 +58,8 @@ def timed(values: object, units: str = "s") -> Change:
     return lambda ds: ds.assign_coords(time=("time", values, {"units": units}))
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
+test_bad_capture = refused(
+    lambda change: schema.check(change(example("capture")), "capture"),
     [
         (
             lambda ds: ds.transpose("time", "band", "y", "x"),
@@ -85,10 +86,6 @@ def timed(values: object, units: str = "s") -> Change:
         (lambda ds: ds["counts"], "Invalid capture of type DataArray. Must be a Dataset"),
     ],
 )
-def test_bad_capture(change: Change, message: str) -> None:
-    """Each rule of a capture has its error, with the name, the value and the rule."""
-    with pytest.raises((TypeError, ValueError), match=re.escape(message)):
-        schema.check(change(example("capture")), "capture")
 
 
 def test_coordinates_of_other_stages() -> None:

@@ -43,7 +43,6 @@ def check(capture: xr.Dataset, true: np.ndarray, share: float, within: float) ->
     """The shift is known in a share of the pixels, its median error small [pixel]."""
     field = schema.check(alignment.reflection_shift(capture, RESPONSE), "reflection_shift")
     error, _ = errors(field, true)
-    print(f"median error {np.median(np.abs(error[1])):.3f} pixel of {error.shape[1]} pixels")
     assert error.shape[1] > share * true[0].size
     assert np.median(np.abs(error[1])) < within
     return field
@@ -70,7 +69,6 @@ def test_border_of_the_image(seed: int) -> None:
     inner, known = np.zeros(shift["known"].shape, dtype=bool), shift["known"].values
     inner[6:-6, 6:-6] = True
     error = (np.abs(shift["shift"].sel(axis="x").values) - 2.0)[known & ~inner]
-    print(f"{np.sqrt(np.mean(error**2)):.3f} pixel off at the border")
     assert np.sqrt(np.mean(error**2)) < 0.03
 
 
@@ -195,7 +193,6 @@ def test_reflections_that_mostly_change_slowly(seed: int) -> None:
     known = float(field["known"].values[moving].mean())
     error = (field["shift"].values - scene["shift"].values)[1][moving & field["known"].values]
     apart = np.median(np.abs(error - np.median(error)))
-    print(f"known {known:.2f}, error along the baseline {apart:.3f} pixel")
     assert known > 0.9
     assert apart < 0.1
     assert abs(np.median(error)) < 0.2
@@ -206,7 +203,6 @@ def test_large_field() -> None:
     """Tens of pixels are found from coarse pictures to fine ones."""
     capture, true = drawn(45, (45.0, 8.0), Picture(shape=(160, 240)), frames=150)
     error, _ = errors(alignment.reflection_shift(capture, RESPONSE), true)
-    print(f"median {np.median(np.abs(error), axis=1)} pixel of {error.shape[1]}")
     assert error.shape[1] > 0.5 * true[0].size
     assert np.median(np.abs(error[1])) < 0.05
 

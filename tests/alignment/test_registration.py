@@ -238,5 +238,4 @@ def test_clocks_are_found(
     corrected = correct_capture(recording.capture, fitted)
     aligned = alignment.align(corrected, transform=whole.registration(rig["view"]))
     frames = clock[1] * aligned.attrs["time_offset"][1]
-    print(f"clock {frames:.3f} frames, true {0.5 * rig['late']}")
     assert abs(frames - 0.5 * rig["late"]) < 0.1

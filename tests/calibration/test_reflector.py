@@ -53,16 +53,13 @@ def measured(of: xr.Dataset, warm: float, foil: float, number: int = 1) -> xr.Da
     return xr.Dataset(labelled | read, {"band": of["band"].values})
 
 
-def test_exact_without_errors(known: xr.Dataset) -> None:
-    """Exact signals give the exact emissivity, from one measurement too."""
+def test_deviation_is_the_standards_formula(known: xr.Dataset) -> None:
+    """One exact measurement gives the exact emissivity, and its deviation is
+    sqrt(W^2 + e^2 Wo^2 + (1-e)^2 Wr^2) / |Wo - Wr|.
+    """
     found = calibration.reflector_emissivity(measured(known, 325.0, 295.0), known, STDS)
     np.testing.assert_allclose(found["emissivity"], TRUE, rtol=0, atol=1e-12)
     assert np.all(np.isnan(found["reduced_chi2"]))
-
-
-def test_deviation_is_the_standards_formula(known: xr.Dataset) -> None:
-    """One measurement's deviation: sqrt(W^2 + e^2 Wo^2 + (1-e)^2 Wr^2) / |Wo - Wr|."""
-    found = calibration.reflector_emissivity(measured(known, 325.0, 295.0), known, STDS)
     curve = response.curve(known, "9.5")
     noise, share = float(known["noise"].sel(band="9.5")), TRUE[1]
     of_object = float(curve.count_slope(325.0)) * STDS[0]
@@ -212,21 +209,24 @@ def test_no_convergence_is_an_error(known: xr.Dataset, monkeypatch: pytest.Monke
         calibration.fit_emissivity(series, known, STDS)
 
 
-test_bad_bias = refused(
-    lambda options: Bias(**options),
+COLD = Bench(object_temperatures=(300.0,))
+
+
+test_bad_bias_and_bench = refused(
+    lambda known, call: call(known),
     [
-        ({"object_tolerance": -0.5}, r"Invalid object_tolerance \[K\] -0.5. Must lie in \[0.0, "),
-        ({"contact": (0.05, 0.0)}, r"Invalid contact \(0.05, 0.0\). Must be a range"),
-        ({"stray": (0.0, 1.0)}, r"Invalid stray \(0.0, 1.0\). Must be a range"),
-        ({"air_temperature": -20.0}, r"Invalid air_temperature \[K\] -20.0"),
+        (lambda _: Bias(object_tolerance=-0.5), "object_tolerance [K] -0.5. Must lie in [0.0, "),
+        (lambda _: Bias(contact=(0.05, 0.0)), "Invalid contact (0.05, 0.0). Must be a range"),
+        (lambda _: Bias(stray=(0.0, 1.0)), "Invalid stray (0.0, 1.0). Must be a range"),
+        (lambda _: Bias(air_temperature=-20.0), "Invalid air_temperature [K] -20.0"),
+        (
+            lambda it: reflector_series(it, OBJECTS[0], COLD, np.random.default_rng(0)),
+            "One must be 10.0 K above the air's 295.15 K",
+        ),
+        (
+            lambda it: compare_procedures(it, np.random.default_rng(0), repeats=1),
+            "Invalid comparison of 5 samples, 1 times",
+        ),
     ],
+    "known",
 )
-
-
-def test_bad_bench(known: xr.Dataset) -> None:
-    """Too cold an object, and too few repeats, raise a ValueError."""
-    cold = Bench(object_temperatures=(300.0,))
-    with pytest.raises(ValueError, match=r"One must be 10\.0 K above the air's 295\.15 K"):
-        reflector_series(known, OBJECTS[0], cold, np.random.default_rng(0))
-    with pytest.raises(ValueError, match="Invalid comparison of 5 samples, 1 times"):
-        compare_procedures(known, np.random.default_rng(0), repeats=1)

@@ -149,14 +149,6 @@ def test_recorded_flags_tell_the_shutter(recorded: Recorded) -> None:
     assert by_images.attrs["shutter_closed_frames"] == without.attrs["shutter_closed_frames"]
 
 
-def test_a_missing_dataset_is_named(recorded: Recorded) -> None:
-    """Without a capture or a correction the error says which."""
-    with pytest.raises(TypeError, match="Invalid correction of type NoneType"):
-        correct_capture(recorded.raw, None)  # type: ignore[arg-type]
-    with pytest.raises(TypeError, match="Invalid capture of type NoneType"):
-        correct_capture(None, recorded.correction)  # type: ignore[arg-type]
-
-
 @pytest.mark.filterwarnings("ignore:Fixed pattern")
 def test_damaged_frames_are_left_out(recorded: Recorded) -> None:
     """A frame without an exposure time is NaN, and after the lag is undone so is the next."""

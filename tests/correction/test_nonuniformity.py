@@ -222,44 +222,48 @@ def test_provenance_is_written(capture: xr.Dataset, correction: xr.Dataset) -> N
     }
 
 
-@pytest.mark.parametrize(
-    ("of_capture", "of_correction", "message"),
+def gained(correction: xr.Dataset, gain: float) -> xr.Dataset:
+    """The correction with another gain of its good pixels."""
+    return correction.assign(gain=correction["gain"].where(correction["bad"], gain))
+
+
+FLOATING = xr.DataArray(np.zeros((2, 4)), dims=("y", "x"))  # a status of no bits
+
+
+test_what_does_not_fit_is_refused = refused(
+    lambda capture, correction, call: call(capture, correction),
     [
-        (lambda it: it.astype(float), None, "Invalid dtype float64 of the capture's counts"),
-        (lambda it: it.isel(time=[0, 2, 1]), None, "Unordered 'time'"),
-        (None, lambda it: it.isel(band=[1, 2]), "Missing band '9.5' in the correction"),
-        (None, lambda it: it.isel(x=slice(3)), "Invalid size 3 of 'x' of the correction"),
+        (lambda c, k: correct(c.astype(float), k), "Invalid dtype float64 of the capture's counts"),
+        (lambda c, k: correct(c.isel(time=[0, 2, 1]), k), "Unordered 'time'"),
+        (lambda c, k: correct(c, k.isel(band=[1, 2])), "Missing band '9.5' in the correction"),
+        (lambda c, k: correct(c, k.isel(x=slice(3))), "Invalid size 3 of 'x' of the correction"),
+        (lambda c, k: correct(c, gained(k, np.nan)), "gain of the correction: not finite"),
+        (lambda c, k: correct(c, gained(k, -1.0)), "Invalid gain .* a gain positive"),
+        (lambda c, k: correct(c, k.drop_vars("bad")), "Missing 'bad'"),
+        (lambda c, k: correct(c, k.assign(offset_std=2.0)), "Invalid dims .* of 'offset_std'"),
+        (lambda c, k: correct(correct(c, k), k), "corrected before"),
         (
-            None,
-            lambda it: it.assign(gain=it["gain"] * np.nan),
-            "gain of the correction: not finite",
+            lambda c, k: correct(c.assign_coords(y=[0, 1]), k.assign_coords(y=[1, 2])),
+            "Invalid 'y' of the correction: 1 at position 0",
         ),
-        (None, lambda it: it.assign(gain=-it["gain"]), r"Invalid gain .* a gain positive"),
-        (None, lambda it: it.drop_vars("bad"), "Missing 'bad'"),
-        (None, lambda it: it.assign(offset_std=2.0), "Invalid dims .* of 'offset_std'"),
+        (
+            lambda c, k: undo_lag(correct(c, k).assign(status=FLOATING), 0.01),
+            "Invalid dtype float64 of 'status' of the corrected",
+        ),
+        *(  # as by `correct`
+            (
+                lambda _, k, gain=gain: renew_offset(gained(k, gain), 0 * k["offset"] + 20000.0),
+                "Invalid gain of the correction",
+            )
+            for gain in (np.nan, np.inf, 0.0, -1.0)
+        ),
     ],
+    "capture correction",
 )
-def test_what_does_not_fit_is_refused(
-    capture: xr.Dataset, correction: xr.Dataset, of_capture: Any, of_correction: Any, message: str
-) -> None:
-    """A scaled capture, other times, bands or pixels, and a correction that is not whole."""
-    changed = [
-        one if change is None else change(one)
-        for one, change in ((capture, of_capture), (correction, of_correction))
-    ]
-    with pytest.raises((TypeError, ValueError), match=message):
-        correct(*changed)
 
 
-def test_a_capture_is_corrected_once(capture: xr.Dataset, correction: xr.Dataset) -> None:
-    """Second and displaced corrections are refused; a bad pixel's gain may be anything."""
-    corrected, placed = correct(capture, correction), capture.assign_coords(y=[0, 1])
-    with pytest.raises(ValueError, match="corrected before"):
-        correct(corrected, correction)
-    with pytest.raises(ValueError, match="Invalid 'y' of the correction: 1 at position 0"):
-        correct(placed, correction.assign_coords(y=[1, 2]))
-    with pytest.raises(TypeError, match="Invalid dtype float64 of 'status' of the corrected"):
-        undo_lag(corrected.assign(status=corrected["status"].astype(float)), 0.01)
+def test_a_bad_pixel_s_gain_may_be_anything(capture: xr.Dataset, correction: xr.Dataset) -> None:
+    """Also negative, of all pixels."""
     turned = correction.assign(gain=-correction["gain"])
     correct(capture, turned.assign(bad=xr.ones_like(correction["bad"])))
 
@@ -337,11 +341,3 @@ def test_maximum_is_a_whole_number(
         correct(capture, correction, maximum=maximum)  # type: ignore[arg-type]
     with pytest.raises((TypeError, ValueError), match="Invalid maximum of the detector"):
         fit_correction(ideal, maximum=maximum)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("gain", [np.nan, np.inf, 0.0, -1.0])
-def test_offsets_are_not_renewed_with_a_bad_gain(correction: xr.Dataset, gain: float) -> None:
-    """A good pixel's gain that is not finite and positive is refused as by `correct`."""
-    spoilt = correction.assign(gain=correction["gain"].where(correction["bad"], gain))
-    with pytest.raises(ValueError, match="Invalid gain of the correction"):
-        renew_offset(spoilt, 0 * correction["offset"] + 20000.0)

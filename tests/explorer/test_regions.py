@@ -3,9 +3,9 @@
 import math
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from refused import refused
 
 from dbthermal.explorer import Region
 
@@ -33,8 +33,8 @@ def test_a_rectangle_is_a_polygon_of_four_corners(
     np.testing.assert_array_equal(rectangle.mask(SHAPE), polygon.mask(SHAPE))
 
 
-@pytest.mark.parametrize(
-    ("kind", "points", "message"),
+test_bad_regions_are_refused = refused(
+    Region,
     [
         ("circle", ((0, 0), (1, 1)), "Unknown kind of region 'circle'"),
         ("rectangle", ((0, 0),), "Invalid 1 points of a rectangle. Must be 2"),
@@ -42,8 +42,5 @@ def test_a_rectangle_is_a_polygon_of_four_corners(
         ("ellipse", ((0, 0), (1, math.nan)), "Must be finite"),
         ("ellipse", (1, 2), r"Must be pairs \(row, column\)"),
     ],
+    error=ValueError,
 )
-def test_bad_regions_are_refused(kind: str, points: tuple[object, ...], message: str) -> None:
-    """The error names the kind, the points and the rule."""
-    with pytest.raises(ValueError, match=message):
-        Region(kind, points)  # type: ignore[arg-type]

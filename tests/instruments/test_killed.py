@@ -93,8 +93,7 @@ def check_written(opened: xr.Dataset) -> list[int]:
 
 
 @pytest.mark.parametrize(
-    "share",
-    [*MOMENTS, *(pytest.param(p, marks=pytest.mark.slow) for p in np.linspace(0.1, 1, 19))],
+    "share", [*MOMENTS, *(pytest.param(p, marks=pytest.mark.slow) for p in np.linspace(0.1, 1, 19))]
 )
 def test_kill_costs_the_last_chunk(tmp_path: Path, share: float) -> None:
     """Killed at any moment, a recording opens and lacks less than a chunk of each band."""

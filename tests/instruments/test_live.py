@@ -257,7 +257,6 @@ def test_a_separation_is_shown_beside_the_frames() -> None:
     truth = scene.sel(time=result["time"].values - 100.0, method="nearest")
     error = result["object_temperature"].values - truth["object_temperature"].values
     off = float(np.median(abs(error[:, result["status"].values == 0])))
-    print(f"emulated camera: median error {off:.3f} K")
     assert off < 0.3  # K
     assert any("of the pixels without a flag" in text for text in texts(view))
     assert view.figure is not None

@@ -23,14 +23,9 @@ FRAMES = 15
 EVERY = pytest.mark.parametrize("every", [500, pytest.param(137, marks=pytest.mark.slow)])
 
 
-def itself(path: Path) -> Path:
-    """Rename the recording."""
-    return path.rename(path.with_name("renamed.zarr"))
-
-
-def parent(path: Path) -> Path:
-    """Rename the folder that it is in."""
-    return path.parent.rename(path.parent.with_name("renamed")) / path.name
+def renamed(path: Path) -> Path:
+    """Rename a folder."""
+    return path.rename(path.with_name(f"renamed{path.suffix}"))
 
 
 def elsewhere(path: Path) -> Path:
@@ -43,14 +38,18 @@ def elsewhere(path: Path) -> Path:
 
 def replaced_by_another(path: Path) -> Path:
     """Rename it, and put another folder there that looks like it."""
-    place = itself(path)
-    shutil.copytree(place, path)
+    shutil.copytree(place := renamed(path), path)
     return place
 
 
-def twice(path: Path) -> Path:
-    """Rename it and what it is in."""
-    return parent(itself(path))
+MOVES: dict[str, Callable[[Path], Path]] = {
+    "itself": renamed,
+    "parent": lambda path: renamed(path.parent) / path.name,
+    "elsewhere": elsewhere,
+    "replaced by another": replaced_by_another,
+    "itself and parent": lambda path: renamed(renamed(path).parent) / "renamed.zarr",
+}
+"""What is done to the folder of a recording, and where the recording lies then."""
 
 
 def write(path: Path, then: Callable[[int], object] = lambda _: None) -> Path:
@@ -72,14 +71,12 @@ def moments(tmp_path: Path, every: int, case: int) -> range:
 
 
 @EVERY
-@pytest.mark.parametrize(
-    ("case", "move"), [*enumerate([itself, parent, elsewhere, replaced_by_another, twice])]
-)
+@pytest.mark.parametrize(("case", "name"), [*enumerate(MOVES)])
 def test_moved_at_any_operation_it_goes_on(
-    tmp_path: Path, case: int, move: Callable[[Path], Path], every: int
+    tmp_path: Path, case: int, name: str, every: int
 ) -> None:
     """Moved before any file operation, the recording is whole at its new place, and says so."""
-    noted = 0
+    move, noted = MOVES[name], 0
     for moment in (chosen := moments(tmp_path, every, case)):
         path, places = tmp_path / f"{moment}" / "deep" / "a.zarr", list[Path]()
         path.parent.mkdir(parents=True)
@@ -96,55 +93,45 @@ def test_moved_at_any_operation_it_goes_on(
         check(opened, 2 * [FRAMES])
         readings = [value for _, kind, _, value in notes(place) if kind == "reading"]
         np.testing.assert_array_equal(readings, np.arange(FRAMES))
-        assert path.exists() == (move is replaced_by_another)
+        assert path.exists() == (name == "replaced by another")
         noted += "folder_moved" in [note[1] for note in notes(place)]
         shutil.rmtree(tmp_path / f"{moment}")
     assert noted >= 0.6 * len(chosen)  # the last operations, of closing, come after the last note
 
 
-def deleted(path: Path) -> None:
-    """Delete the recording."""
+def copied(path: Path) -> Path:
+    """Copy a folder, as to another disk, and delete it; the copy."""
+    shutil.copytree(path, copy := path.parent.with_name(f"{path.parent.name}-copy"))
     shutil.rmtree(path)
+    return copy
 
 
-def carried_off(path: Path) -> None:
-    """Take it to another disk: copy it, and delete it."""
-    shutil.copytree(path, path.with_name("copy.zarr"))
-    shutil.rmtree(path)
-
-
-def array_moved(path: Path) -> None:
-    """Rename the folder of an array."""
-    (path / "counts").rename(path / "old")
-
-
-def array_replaced(path: Path) -> None:
-    """Put a copy in place of the folder of an array."""
-    shutil.copytree(path / "counts", path.parent / "copy")
-    shutil.rmtree(path / "counts")
-    (path.parent / "copy").rename(path / "counts")
+LOSSES: dict[str, Callable[[Path], object]] = {
+    "deleted": shutil.rmtree,
+    "carried off": copied,
+    "array moved": lambda path: (path / "counts").rename(path / "old"),
+    "array replaced": lambda path: copied(path / "counts").rename(path / "counts"),
+}
+"""What is done to the folder of a recording, or to that of an array in it."""
 
 
 @EVERY
-@pytest.mark.parametrize(
-    ("case", "lose"), [*enumerate([deleted, carried_off, array_moved, array_replaced])]
-)
-def test_without_a_part_it_ends(
-    tmp_path: Path, case: int, lose: Callable[[Path], None], every: int
-) -> None:
+@pytest.mark.parametrize(("case", "name"), [*enumerate(LOSSES)])
+def test_without_a_part_it_ends(tmp_path: Path, case: int, name: str, every: int) -> None:
     """Without its folder, or an array's, a recording ends with its name, and makes no other."""
+    said = "No array 'counts'" if "array" in name else r"a\.zarr"
     for moment in moments(tmp_path, every, case):
         path = tmp_path / f"{moment}" / "a.zarr"
         path.parent.mkdir()
-        said = "No array 'counts'" if "array" in lose.__name__ else r"a\.zarr"
-        with pytest.raises(OSError, match=said), before_operation(moment, partial(lose, path)):
+        lose = partial(LOSSES[name], path)
+        with pytest.raises(OSError, match=said), before_operation(moment, lose):
             write(path)
-        if lose is array_moved:
+        if name == "array moved":
             shutil.rmtree(path / "counts", ignore_errors=True)  # of a chunk that is not valid
             (path / "old").rename(path / "counts")
-        if lose is deleted:
+        if name == "deleted":
             assert not path.exists()
-        elif lose is not carried_off:  # a copy of a moment is whole or refused, by its checksums
+        elif name != "carried off":  # a copy of a moment is whole or refused, by its checksums
             opened = store.open_dataset(path)
             assert opened.attrs["complete"] is False
             check(opened, 2 * [opened.sizes["time"]])

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 
 import pytest
 import serial
+from refused import refused
 
 from dbthermal import instruments
 from dbthermal.instruments.camera import KINDS
@@ -85,8 +86,8 @@ def test_a_line_that_takes_no_bytes_is_an_error(terminal: Terminal) -> None:
     terminal.line._port.reset_output_buffer()
 
 
-@pytest.mark.parametrize(
-    ("url", "message"),
+test_a_wrong_name_is_refused = refused(
+    lambda url: open_serial(url, baudrate=115200),
     [
         ("/dev/ttyACM0", "Invalid address '/dev/ttyACM0'. Must be serial:///dev/<port>"),
         ("serial://", "Invalid address 'serial://'. Must be serial:///dev/<port>"),
@@ -97,11 +98,8 @@ def test_a_line_that_takes_no_bytes_is_an_error(terminal: Terminal) -> None:
         ("serial:///etc/a", "Invalid address"),
         ("serial:///dev/nothing-here", "Could not open '/dev/nothing-here'"),
     ],
+    error=(ValueError, TransportError),
 )
-def test_a_wrong_name_is_refused(url: str, message: str) -> None:
-    """An unknown part of an address and a missing port raise errors with the rule or the name."""
-    with pytest.raises((ValueError, TransportError), match=message):
-        open_serial(url, baudrate=115200)
 
 
 class Port:

@@ -285,9 +285,7 @@ def test_other_systems_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
         v4l2.open_url("v4l2:///dev/video0", STREAM)
 
 
-numbers = st.tuples(
-    *(st.integers(0, highest) for highest in (2**31, 2**32 - 1, 10**6 - 1, 60_000)),
-)
+numbers = st.tuples(*(st.integers(0, highest) for highest in (2**31, 2**32 - 1, 10**6 - 1, 60_000)))
 
 
 @given(st.lists(numbers, max_size=20))

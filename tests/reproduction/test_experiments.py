@@ -1,14 +1,18 @@
-"""Experiments: scores of results with known errors, and scenes of a case that are as described."""
+"""Experiments: scenes of a case are as described; limits, nuisances and flags are known."""
 
-import re
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 import xarray as xr
+from refused import refused
 
+from dbthermal import readers, schema
 from dbthermal import response as responses
 from dbthermal.simulation import Rig
+from reproduction import paths
+from reproduction.experiments import flags, limits, nuisances
 from reproduction.experiments.cases import simulate
 
 TIME = np.arange(350) / 10.0  # s
@@ -70,22 +74,89 @@ def test_bands_apart(offset: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"start": None}, r"Must have \['emissivity', 'start', 'stop'\]"),
-        ({"offset": 0.33}, r"Invalid offset 0.33 frames. Must be zero or positive, a multiple"),
-        ({"offset": -1.0}, r"Invalid offset -1.0 frames. Must be zero or positive"),
-        ({"frames": 351}, r"Invalid number of frames 351. Must lie in \[2, 350\]"),
-        ({"jump": {"between": [5.0, 4.0]}}, r"Invalid between \[5.0, 4.0\] s of a jump"),
-        ({"jump": {"duration": -1.0}}, r"Invalid duration -1.0 s of a jump"),
-        ({"emisivity": [0.9, 0.8]}, re.escape("with keys ['case', 'emisivity', 'emissivity',")),
-    ],
+    ("moved", "right", "bleeding"), [(0, 1.0, 0), (2, 1.0, 0), (5, 1 - 3 / 36, 1), (None, 0.0, 0)]
 )
-def test_values_of_a_case(change: dict[str, Any], message: str) -> None:
-    """Invalid, unknown and missing values, and bands apart on uneven times, are errors."""
-    case = {key: value for key, value in (GLASS | change).items() if value is not None}
-    with pytest.raises(ValueError, match=message):
-        simulate(case, Rig(), TIME, 20, seed=4)
-    uneven = np.append(TIME[:-1], TIME[-1] + 0.05)
-    with pytest.raises(ValueError, match="Invalid times of bands that are exposed apart"):
-        simulate(GLASS | {"offset": 1.0}, Rig(), uneven, 5, 0)
+def test_border_is_judged_beyond_two_pixels(moved: int | None, right: float, bleeding: int) -> None:
+    """A border two pixels off is kept; five off, three columns of 36 bleed; without labels 0."""
+    columns = xr.DataArray(np.indices((10, 40))[1], dims=("y", "x"))
+    labels = columns * 0 - 1 if moved is None else (columns >= 20 + moved).astype(int)
+    kept = limits.border_kept(labels, (columns >= 20).astype(int))
+    assert float(kept["right"]) == pytest.approx(right, abs=1e-12)
+    assert int(kept["bleeding"]) == bleeding
+
+
+def made(**changes: Any) -> Callable[[], object]:
+    """A case of glass with changes, or without the keys that are None."""
+    case = {key: value for key, value in (GLASS | changes).items() if value is not None}
+    return lambda: simulate(case, Rig(), TIME, 20, seed=4)
+
+
+UNEVEN = np.append(TIME[:-1], TIME[-1] + 0.05)
+VIEWS: dict[str, Any] = {"shape": [24, 32], "clock": [50, 10.0], "seed": 1}
+POOLED: dict[str, Any] = {"pixels": 400, "seed": 1, "ends": [20.0, 45.0], "clock": [350, 10.0]}
+
+
+test_experiments_that_cannot_be_made = refused(
+    lambda call: call(),
+    [
+        (made(start=None), "Must have ['emissivity', 'start', 'stop']"),
+        (made(offset=0.33), "Invalid offset 0.33 frames. Must be zero or positive, a multiple"),
+        (made(offset=-1.0), "Invalid offset -1.0 frames. Must be zero or positive"),
+        (made(frames=351), "Invalid number of frames 351. Must lie in [2, 350]"),
+        (made(jump={"between": [5.0, 4.0]}), "Invalid between [5.0, 4.0] s of a jump"),
+        (made(jump={"duration": -1.0}), "Invalid duration -1.0 s of a jump"),
+        (made(emisivity=[0.9, 0.8]), "with keys ['case', 'emisivity', 'emissivity',"),
+        (lambda: simulate(GLASS | {"offset": 1.0}, Rig(), UNEVEN, 5, 0), "are exposed apart"),
+        (lambda: limits.pooled([3], [0.86, 0.72], **POOLED), "Invalid size 3 of a group. Must div"),
+        (lambda: nuisances.disturbed("rain", pixels={}, nuisance={}, seed=1), "nuisance 'rain'"),
+        (lambda: nuisances.parallax(0.1, shift=[0.0, 0.0], **VIEWS), "multiples of 1/4 along x"),
+        (lambda: nuisances.parallax(1.0, shift=[12.0, 0.0], **VIEWS), "within 12 together"),
+    ],
+    error=ValueError,
+)
+
+
+BASE = {"emissivity": [0.86, 0.72], "start": 20.0, "stop": 45.0}
+
+
+@pytest.fixture(scope="module")
+def rates() -> xr.Dataset:
+    """Rates over few pixels, with one clean scene; the "gray" scene is clean as well."""
+    pictures: dict[str, dict[str, Any]] = {
+        "completed_from_prior": {"still": 0.5},
+        "no_reflection_pair": {"shift": [6.0, 2.0]},
+    }
+    expected: dict[str, dict[str, Any]] = {flag: {} for flag in (*flags.FAULTS, "gray")} | pictures
+    scenes = {flag: [scene] for flag, scene in expected.items()}
+    return flags.rates(scenes, {"clean": {}}, BASE, pixels=40, clock=[350, 10.0], seed=3)
+
+
+def test_damaged_samples_are_flagged(rates: xr.Dataset) -> None:
+    """Samples damaged in every second pixel get their flag, and no pixel is silently wrong."""
+    rows = rates.sel(flag=list(flags.FAULTS))
+    np.testing.assert_array_equal(rows["pixels"], 20)
+    np.testing.assert_array_equal(rows["clean_pixels"], 60)
+    np.testing.assert_array_equal(rows["without_it"], 0.0)
+    np.testing.assert_array_equal(rows["false_alarms"], 0.0)
+
+
+def test_a_flag_that_should_not_come_is_missed_and_not_wrong(rates: xr.Dataset) -> None:
+    """A clean scene named as that of a gray body counts as missed, and as right."""
+    row = rates.sel(flag="gray")
+    np.testing.assert_allclose([row["without_it"], row["without_any"]], 1.0, rtol=0, atol=0.1)
+    assert float(row["wrong"]) == 0.0
+    assert bool(rates["without_it"].sel(flag="dead_pixel").isnull())
+
+
+def test_pictures_have_pixels_with_and_without(rates: xr.Dataset) -> None:
+    """Where half a picture rests, or a border has no pair, the flag comes there and only there."""
+    rows = rates.sel(flag=["completed_from_prior", "no_reflection_pair"])
+    assert bool(((rows["pixels"] > 100) & (rows["pixels"] < 1000)).all())
+    np.testing.assert_array_equal(rows["without_it"], 0.0)
+    assert float(rows["false_alarms"].max()) < 0.01
+
+
+def test_every_flag_has_a_scene() -> None:
+    """The full table lacks no flag but that of the optimiser, which the default way never sets."""
+    listed = readers.read_yaml(paths.params("10_limits"))["cases"]["flags"]
+    assert set(schema.Status.bits()) - set(listed) <= {"not_converged"}

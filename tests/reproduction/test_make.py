@@ -200,9 +200,7 @@ def test_killed_at_any_moment(checkout: Path, started: Start, seed: int) -> None
     time.sleep(rng.uniform(0.0, 12.0))  # the whole takes some ten seconds
     running = locked.descendants(process.pid)
     process.send_signal(SIGNALS[name])
-    start = time.monotonic()
     wait_for_end(checkout, process, running)
-    print(f"{name} to {len(running)} processes: all ended after {time.monotonic() - start:.1f} s")
     assert_goes_on(checkout)
 
 

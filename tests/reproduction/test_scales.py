@@ -61,7 +61,6 @@ def test_scale_is_undone(walkers: bool) -> None:
     gain = 1 / np.ptp(truth, axis=(2, 3))
     gain /= gain.mean(axis=1, keepdims=True)
     error = undone["gain"].values / gain - 1
-    print(f"people {walkers}: gains from {gain.min():.2f} to {gain.max():.2f}, {error.std():.4f}")
     assert undone.attrs["scale_undone"] == ["8-14", "9.5"]
     assert min(undone.attrs["scale_explained"]) > 0.97
     assert np.sqrt(np.mean(error**2)) < 0.02
@@ -83,7 +82,6 @@ def test_reflection_of_a_scaled_picture() -> None:
     rapid = [part[:, 20:, :30].reshape(FRAMES, -1) for part in both]
     rapid = [part - functions @ (functions.T @ part) for part in rapid]
     agreement = float(np.corrcoef(rapid[0].ravel(), rapid[1].ravel())[0, 1])
-    print(f"ratio {found.attrs['pooled_ratio']:.2f}, correlation {agreement:.2f}")
     assert found.attrs["pooled_ratio"] == pytest.approx(RATIO, rel=0.1)
     assert agreement > 0.8
 

@@ -39,8 +39,7 @@ def test_topology(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "width", "height"),
-    [("wineglass", 0.084, 0.21), ("coffee_pot", 0.136, 0.165)],
+    ("name", "width", "height"), [("wineglass", 0.084, 0.21), ("coffee_pot", 0.136, 0.165)]
 )
 def test_vessels(name: str, width: float, height: float) -> None:
     """A vessel is as large as described, stands on z = 0, and its upright wall faces outward."""
