@@ -457,8 +457,9 @@ def check_numbers(array: xr.DataArray, label: str, units: str | None = None) -> 
     """Check that an array holds real numbers, of a unit if it states one, and return it."""
     require(array, xr.DataArray, label)
     if array.dtype.kind not in "fui" or array.dtype.itemsize > 8:
-        rule = "Must be a real number" + " of at most 64 bits" * (array.dtype.kind in "fui")
-        rule += ": of dates (time - time[0]) / np.timedelta64(1, 's')" * (array.dtype.kind in "mM")
+        rule = "Must be a real number of at most 64 bits"
+        if array.dtype.kind in "mM":
+            rule += ": of dates (time - time[0]) / np.timedelta64(1, 's')"
         raise TypeError(f"Invalid dtype {array.dtype} of {label}. {rule}.")
     if units is not None and array.attrs.get("units", units) != units:
         raise ValueError(f"Invalid units '{array.attrs['units']}' of {label}. Must be '{units}'.")

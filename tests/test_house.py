@@ -10,23 +10,23 @@ HOUSE = Path(dbthermal.__file__).parent
 
 # Lines and modules that a room may have. A room that grows takes from another; these only fall.
 BUDGET = {
-    "": (3519, 18),
+    "": (3520, 18),
     "_cli": (1248, 5),
     "alignment": (2849, 10),
     "calibration": (795, 2),
     "correction": (1747, 6),
     "emissivity": (423, 1),
-    "explorer": (1285, 6),
+    "explorer": (1282, 6),
     "figures": (596, 3),
     "instruments": (5505, 19),
     "limits": (728, 3),
     "readers": (2702, 12),
-    "reporting": (392, 2),
+    "reporting": (393, 2),
     "separation": (13073, 54),
     "simulation": (564, 2),
     "store": (1410, 6),
 }
-INSTALLED = 36_836  # lines of all rooms
+INSTALLED = 36_835  # lines of all rooms
 
 PRONOUNS = {
     *("one", "other", "others", "own", "part", "parts", "some", "here", "there", "told", "known"),

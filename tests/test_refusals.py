@@ -194,6 +194,10 @@ CASES: list[tuple[Call, str]] = [
         for drift in (-1.0, np.nan, np.inf)
     ),
     (lambda: solve(pool=np.zeros(SHAPE, int)), "Invalid pool of type ndarray"),
+    (
+        partial(separation.separate, CAPTURE, CAMERA, materials=cast(Any, "")),
+        "materials of type str",
+    ),
     (lambda: solve(pool=xr.zeros_like(COUNTS[0, 0])), "Invalid dtype float32 of the pool"),
     (lambda: solve(pool=LABELS[:, :-1]), "Invalid size 7 of 'x' of the pool"),
     (lambda: solve(pool=LABELS.transpose("x", "y")), r"Invalid dims \('x', 'y'\) of the pool"),

@@ -90,8 +90,8 @@ def sources_and_targets(options: Namespace) -> tuple[list[Path], list[Path]]:
     sources = [leaf for name, value in arguments for leaf in leaves(value) if is_source(name, leaf)]
     targets = [value for name, value in arguments if name.endswith(("output", "folder")) and value]
     end = {"explore": ".ipynb", "report": ".html", "export": ""}.get(options.command, ".zarr")
-    for path in (path for path in sources if not path.exists()):
-        raise FileNotFoundError(f"No file or folder '{path}'. Must exist.")
+    if missing := [path for path in sources if not path.exists()]:
+        raise FileNotFoundError(f"No file or folder '{missing[0]}'. Must exist.")
     taken = [source.resolve() for source in sources]
     for path in targets:
         place = path.resolve()

@@ -185,7 +185,7 @@ def explore(options: argparse.Namespace) -> dict[str, Any]:
     with store.whole(options.output, ".ipynb") as draft:
         draft.write_text(json.dumps(notebook | {"nbformat_minor": 5}), encoding="utf-8")
     lacks = any(find_spec(library) is None for library in ("anywidget", "jupyterlab"))
-    install = ", in a clone: python -m pip install '.[explorer]' jupyterlab; then" * lacks
+    install = ", in a clone: python -m pip install '.[explorer]' jupyterlab; then" if lacks else ""
     return {str(options.output): f"opened by{install}: jupyter lab {options.output}"}
 
 

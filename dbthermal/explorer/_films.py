@@ -100,12 +100,8 @@ class Pane:
 
 def opened(data: xr.Dataset | str | Path, label: str) -> xr.Dataset:
     """Dataset, opened if it is the path of a store."""
-    if isinstance(data, str | Path):
-        return store.open_dataset(data)
-    rule = "Must be a Dataset or the path of a store, as from separation.separate"
-    if not isinstance(data, xr.Dataset):
-        raise TypeError(f"Invalid {label} of type {type(data).__name__}. {rule}.")
-    return data
+    schema.require(data, (xr.Dataset, str, Path), label)
+    return data if isinstance(data, xr.Dataset) else store.open_dataset(data)
 
 
 def result_panes(data: xr.Dataset) -> Iterator[Pane]:

@@ -97,6 +97,7 @@ class View:
         self.time = film["time"].values.astype(np.float64)
         self.shape: tuple[int, int] = film.shape[1], film.shape[2]
         shown = self.data if self.capture is None else self.capture
+        schema.require(events, Mapping, "events")
         stated = {name: float(moment) for name, moment in events.items()}
         self.events = _films.marks(shown, self.time) | stated
         for name, moment in self.events.items():

@@ -180,6 +180,7 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
 
 def _chosen(view: View, regions: Mapping[str, Region]) -> dict[str, Region]:
     """Regions that are stated, or the whole image."""
+    schema.require(regions, Mapping, "regions")
     for name, region in regions.items():
         if not isinstance(region, Region):
             raise TypeError(

@@ -194,7 +194,7 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
         bands=order,
         emissivity=value,
         emissivity_covariance=covariance,
-        labels=None if pool is None else numbered(corrected, pool),
+        labels=None if pool is None else numbered(corrected, pool, "pool"),
         displacement=_displacement(corrected, reflection_shift, method, order[0]),
         division=np.zeros((-(-frames // 8), capture["y"].size * capture["x"].size), np.uint8),
     )
@@ -376,7 +376,7 @@ def _displacement(
     return displaced.check(shift, corrected, reference)
 
 
-def numbered(corrected: xr.Dataset, pool: xr.DataArray) -> Labels:
+def numbered(corrected: xr.Dataset, pool: xr.DataArray, label: str = "materials") -> Labels:
     """Labels (pixel) of materials, numbered from 0 without gaps, -1 for pixels of none."""
-    flat = _selection(corrected, pool, "pool", "iu", ("y", "x")).values.ravel().astype(np.int64)
+    flat = _selection(corrected, pool, label, "iu", ("y", "x")).values.ravel().astype(np.int64)
     return np.where(flat >= 0, np.searchsorted(np.unique(flat[flat >= 0]), flat), -1)

@@ -4,7 +4,7 @@ import csv
 import os
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -273,7 +273,7 @@ def test_codes_are_places_in_a_palette() -> None:
 
 
 OTHER: list[tuple[Any, str]] = [
-    (3, "Invalid data of type int. Must be a Dataset or the path of a store"),
+    (3, "Invalid data of type int. Must be a Dataset or a str or a Path"),
     (xr.Dataset({"a": ("x", [1.0])}), "Missing variable 'object_temperature'"),
     (separated().drop_vars("time"), "Missing coordinate 'time'"),
     (separated(object_temperature=np.full((3, 4, 5), 22.0)), "Must be in kelvin, not Celsius"),
@@ -295,6 +295,7 @@ test_bad_data_and_questions_are_refused = refused(
         (lambda view: view.counted("some"), "Unknown pixels 'some'"),
         (lambda _: View(separated(), still()), "Invalid size 60 of 'time' of the capture"),
         (lambda _: View(separated(), events={"lamp": np.nan}), "of the event 'lamp'"),
+        (lambda _: View(separated(), events=cast(Any, [1.0])), "Invalid events of type list"),
     ],
     error=(TypeError, ValueError, FileNotFoundError),
 )

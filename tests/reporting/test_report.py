@@ -5,7 +5,7 @@ import json
 import re
 import shutil
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -167,6 +167,8 @@ def test_bad_input_is_named(tmp_path: Path) -> None:
     regions: Any = {"left": (10, 40, 5, 30)}
     with pytest.raises(TypeError, match=r"region 'left', \(10, 40, 5, 30\)\. Must be an explorer"):
         dbthermal.report(scene(), tmp_path / "scene.html", regions=regions)
+    with pytest.raises(TypeError, match="regions of type list"):
+        dbthermal.report(scene(), tmp_path / "scene.html", regions=cast(Any, [*regions]))
     assert list(tmp_path.iterdir()) == []
 
 
