@@ -274,7 +274,7 @@ def hold(
     whose moving pixels are gray alone: the others are selected by their noise.
     """
     sound, valid = (result["status"].values == 0 for result in (per_pixel, pooled))
-    stay = sound & (~valid | (labels.values < 0))
+    stay = sound & ~valid
     if apart:
         ratios = [result["reflection_ratio_std"].values for result in (pooled, per_pixel)]
         stay |= sound & np.any(ratios[0] > _HARDLY * ratios[1], axis=0)
