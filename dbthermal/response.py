@@ -213,9 +213,10 @@ def accuracy(
     places, stated = schema.band_positions(response, bands, "the response"), dict[str, Array]()
     limits = {"blackbody_emissivity": (1e-3, 1.0), "room_temperature": _numbers.KELVIN}
     for name, default in ACCURACY.items():
-        value = response[name].values if name in response else default
-        within = limits.get(name, (0.0, schema.LARGEST))
-        stated[name] = _numbers.real_numbers(f"{name} of the response", value, within)
+        value = np.asarray(response[name].values if name in response else default, np.float64)
+        stated[name], within = value, limits.get(name, (0.0, schema.LARGEST))
+        if not np.all((value >= within[0]) & (value <= within[1])):
+            _numbers.real_numbers(f"{name} of the response", value, within)  # says which and why
     offset, gain, pattern = (
         np.broadcast_to(stated[name], response.sizes["band"])[places]
         for name in ("offset_std", "gain_std", "pattern_std")
