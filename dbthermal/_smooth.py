@@ -64,11 +64,14 @@ class Subspace:
 def leading(samples: npt.NDArray[Any], count: int) -> npt.NDArray[Any]:
     """Orthonormal functions of time (time, function) that hold most of samples (pixel, time)."""
     sample = np.asarray(samples[:: max(1, len(samples) // (_FOR_EACH * count))], np.float64)
-    # Of what was projected out rounding is left, 1e-8 of the largest; noise of 1 mK is 1e-5.
-    count = min(count, max(1, int(np.linalg.matrix_rank(sample, rtol=_ROUNDED))))
     if len(sample) < sample.shape[1]:
-        return np.asarray(np.linalg.svd(sample, full_matrices=False)[2][:count].T)
-    return np.asarray(np.linalg.eigh(sample.T @ sample)[1][:, : -count - 1 : -1])
+        sizes, functions = np.linalg.svd(sample, full_matrices=False)[1:]
+    else:
+        squares, functions = (array.T[::-1] for array in np.linalg.eigh(sample.T @ sample))
+        sizes = np.sqrt(squares.clip(0.0))
+    # Of what was projected out rounding is left, 1e-8 of the largest; noise of 1 mK is 1e-5.
+    number = max(1, np.count_nonzero(sizes > _ROUNDED * sizes[0]))
+    return np.asarray(functions[: min(count, number)].T)
 
 
 def subspace(

@@ -73,15 +73,14 @@ class Scatters:
 
     @np.errstate(invalid="ignore", divide="ignore", over="ignore")
     def uncontradicted(self, material: tiles.Material) -> tiles.Material:
-        """Material with the ratios of the pixel where its bands contradict it, or are of none.
+        """Material with the ratios of the pixel where its bands contradict it, or it is of none.
 
         As where the second camera sees another material at p than the first at r. There the method
         has the pixel's ratios, too (`pixel.ratios`); its object is what pixels paired with p get.
         """
         white = self.freedom[:, np.newaxis, np.newaxis] * np.eye(len(self.noise))
         whole = np.moveaxis(self.scatter, -1, 0) + white
-        unlike = ~reflection_ratio.agrees(whole, material.ratio / self.noise)
-        unlike &= self.usable
+        unlike = self.usable & ~reflection_ratio.agrees(whole, material.ratio / self.noise)
         ratio = self.ratio
         inverse = reflection_ratio.inverse_energy(self.scatter, ratio, self.noise, self.freedom)
         return replace(

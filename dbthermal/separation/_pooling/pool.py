@@ -266,12 +266,11 @@ def hold(
     A pixel alone has the ratio that its own changes show, with errors of how the cameras are
     paired, or of what is mixed at an edge, in it; at its material's ratio these are in the object.
 
-    It stays alone without a label, where only alone it has no flag, and where most of its material
-    is gray when pooled; of cameras `apart` also where pooling hardly makes its ratio more certain.
-    Else D times the variance of the pixel alone is added, with D the mean square of the difference
-    of the objects in deviations of the pixel alone, its own or that around, if it is no chance, or
-    at a border; `apart` also where the pixel stays alone. At one place not for a material most of
-    whose moving pixels are gray alone: the others are selected by their noise.
+    It stays alone where only so it has no flag, and where most of its material is gray when pooled;
+    of cameras `apart` also where pooling hardly makes its ratio more certain. Else D times its
+    variance alone is added, with D the mean square of the objects' difference in deviations of the
+    pixel alone, of it or those around, if that is no chance, or at a border; `apart` also where it
+    stays alone. At one place not for a material most of whose moving pixels are gray alone.
     """
     sound, valid = (result["status"].values == 0 for result in (per_pixel, pooled))
     stay = sound & ~valid
