@@ -70,7 +70,7 @@ def leading(samples: npt.NDArray[Any], count: int) -> npt.NDArray[Any]:
         squares, functions = (array.T[::-1] for array in np.linalg.eigh(sample.T @ sample))
         sizes = np.sqrt(squares.clip(0.0))
     # Of what was projected out rounding is left, 1e-8 of the largest; noise of 1 mK is 1e-5.
-    number = max(1, np.count_nonzero(sizes > _ROUNDED * sizes[0]))
+    number = max(1, np.count_nonzero(sizes > _ROUNDED * sizes.max(initial=0.0)))
     return np.asarray(functions[: min(count, number)].T)
 
 
