@@ -266,14 +266,14 @@ def hold(
     A pixel alone has the ratio that its own changes show, with errors of how the cameras are
     paired, or of what is mixed at an edge, in it; at its material's ratio these are in the object.
 
-    It stays alone where only so it has no flag, and where most of its material is gray when pooled;
-    of cameras `apart` also where pooling hardly makes its ratio more certain. Else D times its
-    variance alone is added, with D the mean square of the objects' difference in deviations of the
-    pixel alone, of it or those around, if that is no chance, or at a border; `apart` also where it
-    stays alone. At one place not for a material most of whose moving pixels are gray alone.
+    It stays alone without a label, where only so it has no flag, and where most of its material is
+    gray when pooled; of cameras `apart` also where pooling hardly makes its ratio more certain.
+    Else D times its variance alone is added, with D the mean square of the objects' difference in
+    deviations alone, of it or those around, if that is no chance, or at a border; `apart` also if
+    it stays alone. At one place not if most moving pixels of the material are gray alone.
     """
     sound, valid = (result["status"].values == 0 for result in (per_pixel, pooled))
-    stay = sound & ~valid
+    stay = sound & (~valid | (labels.values < 0))
     if apart:
         ratios = [result["reflection_ratio_std"].values for result in (pooled, per_pixel)]
         stay |= sound & np.any(ratios[0] > _HARDLY * ratios[1], axis=0)
