@@ -146,22 +146,27 @@ class Joint:
         near = distance_transform_edt(lost, return_distances=False, return_indices=True)
         curves = np.nan_to_num(curves[:, near[0], near[1]])
         # A reflection resampled off by dd: dq = sum_m w_m (1 - e_m) grad(y) . dd, smoothed in time.
-        weights = (1.0 - self.emissivity) * system.weights(self.inputs, self.emissivity)
-        off = np.nan_to_num(weights[1:].sum(0) * displacement.std).reshape(2, *status.shape)
+        weights = system.weights(self.inputs, self.emissivity)
+        off = ((1.0 - self.emissivity) * weights)[1:].sum(0) * displacement.std
+        off = np.nan_to_num(off).reshape(2, *status.shape)
         slopes = [
             gaussian_filter1d(curves, 1.0, axis=axis, order=1) * component.astype(np.float32)
             for axis, component in zip((1, 2), off, strict=True)
         ]
+        # Without a solution x(p) was taken for x(r): they differ as those nearest do.
+        unsolved = np.isnan(self.signals[0]).all(axis=0).reshape(status.shape)
+        near = distance_transform_edt(unsolved, return_distances=False, return_indices=True)
+        square = np.mean((self.signals[1] - self.signals[0]) ** 2, axis=0).reshape(status.shape)
+        share = (weights * self.emissivity)[1:].sum(0).reshape(status.shape)
+        square = np.nan_to_num(unsolved * share**2 * square[near[0], near[1]])
         factor = self.factor().reshape(status.shape)
         for rows in self.inputs.blocks:
             squares = [np.tensordot(basis, component[:, rows], 1) ** 2 for component in slopes]
-            std[:, rows] = np.sqrt(factor[rows] * std[:, rows] ** 2 + sum(squares))
+            std[:, rows] = np.sqrt(factor[rows] * std[:, rows] ** 2 + sum(squares, square[rows]))
             release()
-        # Without a solution x(p) was taken for x(r), which may be K off beside a gray surface.
-        unsolved = self.unsettled | np.isnan(self.signals[0]).all(axis=0)
+        unsettled = self.unsettled.reshape(status.shape) & (status == 0)
         grown = np.isnan(factor)  # without a solution, whatever stands there
-        flagged = unsolved.reshape(status.shape) & (status == 0) | grown
-        status[flagged] |= np.uint32(Status.NOT_CONVERGED)
+        status[unsettled | grown] |= np.uint32(Status.NOT_CONVERGED)
         for name in result.data_vars:
             if str(name).startswith(("object", "background", "emissivity")):
                 result[name].values[..., grown] = np.nan

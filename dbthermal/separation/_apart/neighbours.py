@@ -200,10 +200,7 @@ def _blurred(sharp: Material, less: Material, more: Material, noise: Array) -> M
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def emissivities(inputs: Inputs, result: xr.Dataset) -> tuple[Floats, Floats]:
-    """Emissivities (band, pixel) [1] of a result that lean on those around, inside of (0, 1).
-
-    And the variance (pixel) of that of the reference band.
-    """
+    """Emissivities (band, pixel) [1] that lean on those around, and variance of the first's."""
     raw, reference = system.first_emissivity(inputs, result), inputs.bands[0]
     variance = result["emissivity_std"].values[reference].ravel().astype(np.float64) ** 2
     sound = (result["status"].values.ravel() == 0) & (variance > 0)

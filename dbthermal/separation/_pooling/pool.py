@@ -30,18 +30,16 @@ Regroup: TypeAlias = Callable[[Material | None], Labels]
 # Share of a material's pixels that have an emissivity alone, from which it is theirs [1].
 _MOST_TOLD: Final = 0.98
 _ROUNDS: Final = 6  # rounds of leaving out pixels that are not of the material
+_INNER: Final = 0.8  # share of a material's pixels that its ratio needs: 12 % less certain
 _MAJORITY: Final = 0.5  # share of a material's pixels that speak for it, from which they do [1]
 # Pixels on either side of which a resampled one is made; single ones in a material are no border.
-_REACH: Final = 2
-_SINGLE: Final = 3
+_REACH, _SINGLE = 2, 3
 _HARDLY: Final = 0.5  # deviation of a ratio pooled over that alone, from which it hardly helps [1]
 _MOSTLY: Final = 0.5  # share of gray pixels from which their material is [1]
 # Square of the difference in deviations that is no chance, of a pixel and of those around [1].
-_MORE: Final = 4.0
-_MORE_AROUND: Final = 1.5
+_MORE, _MORE_AROUND = 4.0, 1.5
 # Deviation of the neighbourhood that shares such errors [pixel], and its least weight [1].
-_AROUND: Final = 1.5
-_SOME: Final = 1e-3
+_AROUND, _SOME = 1.5, 1e-3
 _SQUARE: Final = 8  # side [pixel] of what mirrors the same people at the same time
 _FRAMES: Final = 64  # that tell how much an object differs, about
 
@@ -88,7 +86,7 @@ def _inner(labels: Labels) -> Labels:
     """
     inner = minimum_filter(labels, _SINGLE) == maximum_filter(labels, _SINGLE)
     within = np.bincount(labels[inner] + 1, minlength=labels.max() + 2)
-    few = within < _MAJORITY * np.bincount(labels.ravel() + 1)
+    few = within < _INNER * np.bincount(labels.ravel() + 1)
     return np.where(inner | few[labels + 1], labels, -1).ravel()
 
 
