@@ -370,10 +370,11 @@ def _sampler(inputs: Inputs, rows: slice) -> Callable[[Window, slice | Whole], d
 
     def sampled(window: Window, selected: slice | Whole) -> displaced.Paired:
         if displacement is not None:
-            return displaced.paired(load, displacement, window[0], source, selected, fewest)
+            capture, lines = inputs.capture, window[0]
+            return displaced.paired(capture, load, displacement, lines, source, selected, fewest)
         block, grains = load()
-        lines = slice(window[0].start - rows.start, window[0].stop - rows.start)
-        view = block.isel(y=lines, x=window[1])
+        inner = slice(window[0].start - rows.start, window[0].stop - rows.start)
+        view = block.isel(y=inner, x=window[1])
         if not isinstance(selected, slice):  # as one row
             places = np.divmod(selected[np.newaxis], view.sizes["x"])
             y, x = (xr.DataArray(place, dims=("y", "x")) for place in places)

@@ -10,8 +10,7 @@ sample is known, :math:`s_m (\sum_j W_{rj}^2)^{1/2}`.
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import chain
-from typing import Any, Final, TypeAlias, TypeVar
+from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +20,7 @@ from scipy.sparse import csr_array
 
 from dbthermal import _samples as samples
 from dbthermal import schema
-from dbthermal._arrays import Array, Mask, select
+from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
 from dbthermal.schema import Status
 from dbthermal.separation import _quality as quality
@@ -39,13 +38,22 @@ _LOST_WEIGHT: Final = 0.25  # weight of pixels without a value that the others m
 # an image is high leaves most of them without a weight [1].
 _FEW: Final = 0.5
 _NO_WEIGHT: Final = 1e-3  # weight below which a pixel's flags do not count [1]
-# Memory of samples that are kept, for a capture is read some nine times [byte].
+# Memory of resampled samples that are kept, for a capture is read some nine times [byte].
 _KEPT: Final = 2**29
 
 
 T = TypeVar("T")
-Paired: TypeAlias = tuple[npt.NDArray[Any], Mask, Mask, Bits, Array]
+Paired: TypeAlias = tuple[Array, Mask, Mask, Bits, Array]
 """Counts, samples valid or bridged, those that are valid, status, and noise: see `read`."""
+
+
+class Resampled(NamedTuple):
+    """What the second camera shows of the reflections in some rows, as it is kept."""
+
+    counts: npt.NDArray[np.float32]  # of its bands (band, time, pixel) [count]
+    packed: npt.NDArray[np.uint8] | None  # bits of samples that are valid (time, pixel); None: all
+    status: Bits  # (pixel)
+    gain: Array  # noise (first band and others, pixel) [1] over that of a sample
 
 
 @dataclass(frozen=True)
@@ -59,7 +67,7 @@ class Displacement:
     onward: csr_array  # weights at p + d(p) of the pixels around (p, pixel); 0 outside
     std: Array  # standard deviation of the shift (2, pixel) [pixel]
     found: dict[Hashable, Any] = field(default_factory=dict)  # see `once`
-    read: dict[Hashable, Paired] = field(default_factory=dict)  # see `paired`
+    kept: dict[tuple[int, int], Resampled] = field(default_factory=dict)  # see `paired`
 
     def once(self, key: Hashable, compute: Callable[[], T]) -> T:
         """Return what was computed for a key before: a capture is read many times."""
@@ -176,6 +184,7 @@ def _keys(place: Array, size: int) -> tuple[npt.NDArray[np.intp], Array]:
 
 
 def paired(
+    capture: xr.Dataset,
     load: Callable[[], tuple[xr.Dataset, list[samples.Grain]]],
     displacement: Displacement,
     rows: slice,
@@ -183,28 +192,36 @@ def paired(
     selected: slice | npt.NDArray[np.intp],
     fewest: int,
 ) -> Paired:
-    """Some pixels of some rows as `read`, their short gaps bridged; kept for the next time.
+    """Some pixels of some rows of a capture as `read`, their short gaps bridged.
 
-    In single precision. The source is read if they are not kept; only those of a small capture are.
+    The source is read if these rows are not kept: the others' samples are, in single precision.
     """
-    films, every = displacement.read, (rows.start, rows.stop, b"")
-    chosen = every if isinstance(selected, slice) else (*every[:2], selected.tobytes())
-    reading = films.get(chosen, films.get(every))
-    if reading is None:
+    kept, place, bands = displacement.kept, (rows.start, rows.stop), capture.sizes["band"]
+    resampled = kept.get(place)
+    if resampled is None:
         block, grains = load()
         counts, valid, status, gain = read(block, displacement, rows, source, fewest, grains)
-        counts, usable = quality.bridge(counts, valid, block["time"].values.astype(np.float64))
-        reading = counts.astype(np.float32), usable, valid, status, gain
-    if chosen not in films:
-        share = (rows.stop - rows.start) / displacement.shape[0]
-        if chosen != every:
-            share, reading = 1.0, tuple(select(film, selected) for film in reading)
-        groups = reading, chain(*films.values())
-        size, held = (sum(film.nbytes for film in group) for group in groups)
-        if size + held <= _KEPT and (share == 1.0 or size <= 0.5 * share * _KEPT):
-            films[chosen] = reading
-    counts, usable, valid, status, gain = reading  # the tile is made of them, in place
-    return counts.astype(np.float64), usable, valid, status.copy(), gain
+        packed = None if valid.all() else np.packbits(valid, axis=0)
+        second = counts[displacement.others].astype(np.float32)
+        resampled = Resampled(second, packed, status, gain)
+        if sum(film.counts.nbytes for film in (resampled, *kept.values())) <= _KEPT:
+            kept[place] = resampled
+    status, gain = resampled.status[selected].copy(), resampled.gain[:, selected]
+    first = capture["counts"].isel(band=displacement.reference, y=rows).values
+    first = first.reshape(len(first), -1)[:, selected]
+    valid = np.ones(first.shape, dtype=bool)
+    if resampled.packed is not None:
+        valid = np.unpackbits(resampled.packed[:, selected], axis=0, count=len(first)).view(bool)
+    counts = np.empty((bands, *first.shape))
+    counts[displacement.reference], counts[displacement.others] = (
+        first,
+        resampled.counts[..., selected],
+    )
+    lost = quality.unusable(status)
+    if lost.any() or resampled.packed is not None:
+        counts[:, ~valid | lost] = 0.0
+    counts, usable = quality.bridge(counts, valid, capture["time"].values.astype(np.float64))
+    return counts, usable, valid, status, gain
 
 
 def read(

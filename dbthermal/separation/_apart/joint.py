@@ -44,7 +44,7 @@ _OBJECT: Final = ("object_temperature", "object_temperature_std")
 _ROUNDS: Final = 20
 _SETTLED: Final = 1e-3
 _LEAST_CHANGE: Final = 0.1  # change of the object [K] below which its emissivity is not told
-_FRAMES: Final = 8  # frames that are solved together
+_FRAMES, _PIXELS = 16, 4096  # frames, and pixels, that are solved together
 # Frames from which it is told whether the object's gradient matters, and the share of the object's
 # deviation from which it does, in more than a few of the samples.
 _LOOKED_AT: Final = 32
@@ -114,7 +114,8 @@ class Joint:
     frames: Frames
     signals: Floats  # of the object at r and at p (2, node, pixel) [K]; NaN unknown
     emissivity: Floats  # of which it is made (band, pixel) [1]
-    factor: Callable[[], Floats]  # variance of the object over that of a pixel alone (pixel) [1]
+    # Variance of the object over that of a pixel alone (pixel) [1], by threads.
+    factor: Callable[[Executor], Floats]
     unsettled: Mask  # the iteration did not come to an end (pixel)
 
     def difference(self, pixels: Whole, frames: slice | Whole = slice(None)) -> Floats:
@@ -128,18 +129,21 @@ class Joint:
             relaxation.changes(signals, pixels, share, bend, film)
         return changes if weights is None else weights[frames] @ changes
 
-    def finish(self, result: xr.Dataset) -> None:
+    def finish(self, result: xr.Dataset, threads: Executor) -> None:
         """Give the object of a result its deviation, in place; flag what is unsettled."""
         displacement, status = self.inputs.displacement, result["status"].values
         assert displacement is not None
         time, std = self.inputs.capture["time"].values, result["object_temperature_std"].values
         background = result["background_temperature"].values
         basis = smooth.largest(time).functions.astype(np.float32)
-        every = []
-        for rows in self.inputs.blocks:
+
+        def smoothed(rows: slice) -> Floats:
             film = np.array(background[:, rows]).reshape(time.size, -1)
-            every.append(basis.T @ smooth.bridge(film, np.ones(film.shape[1], dtype=bool)))
             release()
+            film = smooth.bridge(film, np.ones(film.shape[1], dtype=bool))
+            return np.asarray(basis.T @ film)
+
+        every = list(threads.map(smoothed, self.inputs.blocks))
         curves = np.concatenate(every, axis=1).reshape(-1, *status.shape)
         # Beside a pixel without a background it is taken to go on.
         lost = np.isnan(curves[0])
@@ -159,11 +163,14 @@ class Joint:
         square = np.mean((self.signals[1] - self.signals[0]) ** 2, axis=0).reshape(status.shape)
         share = (weights * self.emissivity)[1:].sum(0).reshape(status.shape)
         square = np.nan_to_num(unsolved * share**2 * square[near[0], near[1]])
-        factor = self.factor().reshape(status.shape)
-        for rows in self.inputs.blocks:
+        factor = self.factor(threads).reshape(status.shape)
+
+        def widen(rows: slice) -> None:
             squares = [np.tensordot(basis, component[:, rows], 1) ** 2 for component in slopes]
             std[:, rows] = np.sqrt(factor[rows] * std[:, rows] ** 2 + sum(squares, square[rows]))
             release()
+
+        list(threads.map(np.errstate(invalid="ignore")(widen), self.inputs.blocks))
         unsettled = self.unsettled.reshape(status.shape) & (status == 0)
         grown = np.isnan(factor)  # without a solution, whatever stands there
         status[unsettled | grown] |= np.uint32(Status.NOT_CONVERGED)
@@ -205,22 +212,29 @@ def solve(
             target, size = _by_film(inputs, result, raw, equations, shares, before)
 
         def objects_at(
-            at: Whole, equations: system.Equations, start: Floats | None = None
-        ) -> tuple[Floats, Floats, Floats]:
-            """Object at both places and the last step (solved, frame) [K] of some frames."""
-            combination, guess = target(at)
-            guess = guess if start is None else np.where(np.isfinite(start), start, guess)
-            with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # of the thread
-                return equations.packed.solve(combination, guess, change.at(at))
+            frames: Whole, equations: system.Equations, start: Floats | None = None
+        ) -> tuple[Floats, Floats]:
+            """Object at both places (2, frame, solved) [K] and its last step, of some frames."""
+            packed, films = equations.packed, np.empty((2, frames.size, places.size), np.float32)
+
+            @np.errstate(invalid="ignore", divide="ignore", over="ignore")  # of the thread
+            def solve_some(few: slice) -> Floats:
+                combination, guess = target(frames[few])
+                if start is not None:
+                    guess = np.where(np.isfinite(start[few].T), start[few].T, guess)
+                at_r, at_p, step = packed.solve(combination, guess, change.at(frames[few]))
+                films[0, few], films[1, few] = at_r.T, at_p.T
+                return step
+
+            few = [slice(first, first + _FRAMES) for first in range(0, frames.size, _FRAMES)]
+            return films, np.fmax.reduce([*threads.map(solve_some, few)])
 
         # The object at both places at a few frames: does its gradient matter?
         start = None
         if sampled is frames.nodes and before is not None and before.frames.smooth:
-            start = before.signals[0][:, places].T
-        at_r, at_p, step = objects_at(sampled, equations, start)
-        second = shares[1:].sum(axis=0)[:, np.newaxis]
-        share = np.abs(second * (at_p - at_r)) / size[:, np.newaxis]
-        if not _most(share) > _MATTERS:
+            start = before.signals[0][:, places]
+        films, step = objects_at(sampled, equations, start)
+        if not _most(np.abs(shares[1:].sum(axis=0) * (films[1] - films[0])) / size) > _MATTERS:
             return None
         # The emissivities, if they are not those of a material.
         emissivity = system.inside(raw)
@@ -235,18 +249,15 @@ def solve(
             band = first[:, places], steps[:, places]
             solve_at = partial(objects_at, sampled)
             equations, emissivity, of_slope = _emissivities(
-                inputs, result, raw, solved, equations, solve_at, (at_r, at_p), band
+                inputs, result, raw, equations, solve_at, films, band, threads
             )
-            at_r, at_p, _ = objects_at(sampled, equations, at_r)
-        solutions = [(slice(None), (at_r, at_p, step))]
+            films, _ = objects_at(sampled, equations, films[0])
+        off = equations.spread(np.mean((films[1] - films[0]) ** 2, axis=0))
         if sampled is not frames.nodes:
-            groups = [slice(at, at + _FRAMES) for at in range(0, frames.nodes.size, _FRAMES)]
-            results = threads.map(lambda nodes: objects_at(frames.nodes[nodes], equations), groups)
-            solutions = list(zip(groups, results, strict=True))
-        signals, unsettled = _spread(solutions, (frames.nodes.size, solved.size), places)
+            films, step = objects_at(frames.nodes, equations)
+        signals, unsettled = _spread(films, step, solved.size, places)
         # An error of c_1 = w_1 e_1 is one of all c: dq = (de_1 w_1 + e_1 dw_1) [u(x(r)) - u(x(p))].
-        off = system.weights(inputs, emissivity)[0] ** 2 * of_slope + emissivity[0] ** 2 * of_ratio
-        off *= equations.spread(np.mean((at_p - at_r) ** 2, axis=1))
+        off *= system.weights(inputs, emissivity)[0] ** 2 * of_slope + emissivity[0] ** 2 * of_ratio
         sizes = equations.spread(size), np.where(solved, np.sqrt(np.nan_to_num(off)), 0.0)
     errors = partial(_factor, inputs, equations, np.array(sizes), change.variance, blur)
     return Joint(inputs, frames, signals, emissivity, errors, unsettled)
@@ -267,18 +278,12 @@ def _solvable(
     return raw, variance, solved & np.all(np.isfinite(raw), axis=0)
 
 
-def _spread(
-    solutions: list[tuple[slice, tuple[Floats, Floats, Floats]]],
-    shape: tuple[int, int],
-    places: Whole,
-) -> tuple[Floats, Mask]:
-    """Signals (2, node, pixel) [K] of solutions of some nodes, and the pixels that go on moving."""
-    signals = np.full((2, *shape), np.nan, np.float32)
-    unsettled = np.zeros(shape[1], dtype=bool)
-    for nodes, (*pair, step) in solutions:
-        signals[:, nodes, places] = np.swapaxes(pair, 1, 2)
-        unsettled[places] |= step > 10.0 * relaxation.CONVERGED
-    signals[np.abs(signals) > USELESS] = np.nan
+def _spread(films: Floats, step: Floats, pixels: int, places: Whole) -> tuple[Floats, Mask]:
+    """Signals (2, node, pixel) [K] of solved pixels, and the pixels that go on moving."""
+    signals = np.full((*films.shape[:2], pixels), np.nan, np.float32)
+    signals[..., places] = np.where(np.abs(films) > USELESS, np.nan, films)
+    unsettled = np.zeros(pixels, dtype=bool)
+    unsettled[places] = step > 10.0 * relaxation.CONVERGED
     return signals, unsettled
 
 
@@ -310,7 +315,9 @@ def _by_maps(
         off = ratio + np.where(np.isnan(material.emissivity[places]), np.nan_to_num(std), 0.0)
         off[0] = 1.0
         change, _ = maps.combined(null_combination(off, noise)[0] - weights, places)
-        variance = variance + np.mean((maps.object_part @ change) ** 2, axis=0)
+        # The mean square over time of a sum of functions, by their products.
+        products = maps.object_part.T @ maps.object_part / len(maps.object_part)
+        variance = variance + (change * (products @ change)).sum(axis=0)
 
     def target(at: Whole) -> tuple[Floats, Floats]:
         q = np.ascontiguousarray((maps.object_part[at] @ combined).T, np.float32)
@@ -354,18 +361,20 @@ def _emissivities(
     inputs: Inputs,
     result: xr.Dataset,
     raw: Floats,
-    solved: Mask,
     equations: system.Equations,
-    solve_at: Callable[[system.Equations, Floats], tuple[Floats, Floats, Floats]],
-    places: tuple[Floats, Floats],
+    solve_at: Callable[[system.Equations, Floats], tuple[Floats, Floats]],
+    films: Floats,
     band: tuple[Floats, Floats],
+    threads: Executor,
 ) -> tuple[system.Equations, Floats, Floats]:
     """Equations of the emissivities of the object at its own place, these, and e_1's variance."""
     emissivity, noise = system.inside(raw), inputs.noise[inputs.bands[0]]
     measured = np.isfinite(result["emissivity"].values[inputs.bands[0]].ravel())
-    step = np.zeros(solved.size)
+    solved, step = equations.spread(np.ones(films.shape[2], dtype=bool)), np.zeros(len(raw[0]))
+    few = [slice(first, first + _PIXELS) for first in range(0, films.shape[2], _PIXELS)]
     for _ in range(_ROUNDS):
-        estimates = _emission(places, band, emissivity[0, solved], noise)
+        emit = partial(_emission, films, band, emissivity[0, solved], noise)
+        estimates = map(np.concatenate, zip(*threads.map(emit, few), strict=True))
         slope, variance, sound = (equations.spread(values) for values in estimates)
         likely = 1.0 - system.ratio_of(raw) * (1.0 - slope)
         sound &= measured & np.all((likely > 0.0) & (likely < 1.0), axis=0)
@@ -383,33 +392,39 @@ def _emissivities(
         change = np.abs(emissivity - before)[0, solved]
         if _most(change) < _SETTLED:
             break
-        places = solve_at(equations, places[0])[:2]
+        films, _ = solve_at(equations, films[0])
     return equations, emissivity, variance
 
 
+@np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def _emission(
-    places: tuple[Floats, Floats], band: tuple[Floats, Floats], emissivity: Floats, noise: float
+    films: Floats, band: tuple[Floats, Floats], emissivity: Floats, noise: float, few: slice
 ) -> tuple[Floats, Floats, Mask]:
     """Emissivity of the first band as its slope over the object, its variance, and where it holds.
 
-    Of the object's signals at both places (solved, frame), and those of the band and the steps of
-    the camera in it (frame, solved).
+    Of a few pixels, by the object's signals at both places (2, frame, solved), and those of the
+    band and the steps of the camera in it (frame, solved).
     """
-    signal = places[0].T.astype(np.float64)
-    slope, variance, energy, kernel = regression.lines(signal, band[0], noise)
+    signal, at_p = films[..., few].astype(np.float64)
+    slope, variance, energy, kernel = regression.lines(signal, band[0][:, few], noise)
     # A gradient as steep as the object's own change turns the step round: divide by it.
-    centred = places[0] - places[0].mean(axis=1, keepdims=True)
-    steep = (centred * places[1]).sum(axis=1) / (centred**2).sum(axis=1)
+    centred = signal - signal.mean(axis=0)
+    steep = (centred * at_p).sum(axis=0) / (centred**2).sum(axis=0)
     steep = np.where(np.isfinite(steep) & (steep > 1.0), steep, 1.0)
     # Its variance: of the noise, and what the steps of the camera are as a slope.
-    variance = (variance + (kernel * band[1]).sum(axis=0) ** 2) / steep**2
+    variance = (variance + (kernel * band[1][:, few]).sum(axis=0) ** 2) / steep**2
     sound = energy > _LEAST_CHANGE**2 * len(signal)
-    return emissivity + (slope - emissivity) / steep, variance, sound
+    return emissivity[few] + (slope - emissivity[few]) / steep, variance, sound
 
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def _factor(
-    inputs: Inputs, equations: system.Equations, std: Floats, variance: Floats, blur: float
+    inputs: Inputs,
+    equations: system.Equations,
+    std: Floats,
+    variance: Floats,
+    blur: float,
+    threads: Executor,
 ) -> Floats:
     """Variance (pixel) [1] of the object over that of a pixel alone, by draws; NaN where unsettled.
 
@@ -437,12 +452,14 @@ def _factor(
     change = np.sqrt(variance)[:, np.newaxis] * rng.standard_normal((variance.size, _DRAWS))
     # Propagated by the equations without their bend, a few draws at a time.
     linear = replace(equations, bends=np.zeros_like(equations.bends)).packed
-    places, power = equations.solved, np.zeros(equations.solved.size)
-    for start in range(0, _DRAWS, _FRAMES):
-        few = slice(start, start + _FRAMES)
+    places = equations.solved
+
+    def power_of(few: slice) -> Floats:
         signal, _, _ = linear.solve(target[places, few], errors[places, few], change[:, few])
-        power += np.square(signal, dtype=np.float64).sum(axis=1) / _DRAWS
-    sized, power = size[:, 0] > 0, equations.spread(power)
+        return np.asarray(np.square(signal, dtype=np.float64).sum(axis=1) / _DRAWS)
+
+    few = [slice(start, start + _FRAMES) for start in range(0, _DRAWS, _FRAMES)]
+    sized, power = size[:, 0] > 0, equations.spread(np.sum([*threads.map(power_of, few)], axis=0))
     settled = power < _GROWN * size[:, 0] ** 2  # elsewhere the iteration grows
     # Over a few pixels: neighbours have nearly the same, and the draws are few.
     powers = np.where(settled, [power, size[:, 0] ** 2], 0.0).reshape(2, *displacement.shape)

@@ -58,7 +58,7 @@ def alone(inputs: Inputs, result: xr.Dataset, separate_pixels: Each, threads: Ex
     if material is not None:
         result["reflection_ratio_std"].attrs["pixels"] = neighbours.SHARING
     if objects is not None:
-        objects.finish(result)
+        objects.finish(result, threads)
     displacement.found[_OBJECTS] = objects
 
 
@@ -85,7 +85,8 @@ def pooled(
         # Of a smooth object the difference changes no rapid product.
         plain = replace(inputs, difference=None) if frames.smooth else inputs
         maps = planes.project(plain, before, shares, threads)
-        scatters = {blur: maps.scatters(blur) for blur in neighbours.BLURS}
+        every = threads.map(maps.scatters, neighbours.BLURS)
+        scatters = dict(zip(neighbours.BLURS, every, strict=True))
         survey = partial(
             neighbours.materials, scatters=scatters, per_pixel=before, pooled=materials
         )
@@ -106,4 +107,4 @@ def pooled(
     inputs = replace(inputs, difference=None if objects is None else objects.difference)
     separate_pixels(inputs, material)
     if objects is not None:
-        objects.finish(result)
+        objects.finish(result, threads)
