@@ -298,14 +298,21 @@ def without(weights: csr_array, bad: Mask, width: int) -> csr_array:
     rows = np.flatnonzero((lost > 0) & (lost <= _LOST_WEIGHT))
     if rows.size == 0:
         return weights
+    # The entries of these rows, side by side.
+    start, count = weights.indptr[rows, np.newaxis], np.diff(weights.indptr)[rows, np.newaxis]
+    place = np.arange(count.max())
+    entries = start + np.where(place < count, place, 0)
+    pixels, values = weights.indices[entries], np.where(place < count, weights.data[entries], 0.0)
+    # A plane about their middle.
+    plane = np.stack([np.ones(pixels.shape), *np.divmod(pixels, width)])
+    size = np.abs(values)
+    plane[1:] -= ((plane[1:] * size).sum(axis=-1) / size.sum(axis=-1))[..., np.newaxis]
+    # The smallest change of the others with the same sums over it.
+    off = bad[pixels]
+    kept, missing = np.where(off | (place >= count), 0.0, plane), np.where(off, plane * values, 0.0)
+    change = np.linalg.pinv(np.moveaxis(kept, 0, 1)) @ missing.sum(axis=-1).T[..., np.newaxis]
     weights = weights.copy()
-    for row in rows:
-        entries = slice(weights.indptr[row], weights.indptr[row + 1])
-        pixels, values = weights.indices[entries], weights.data[entries]
-        plane = np.stack([np.ones(pixels.size), *np.divmod(pixels, width)])
-        plane[1:] -= plane[1:] @ np.abs(values)[:, np.newaxis] / np.abs(values).sum()
-        off = bad[pixels]
-        # The smallest change of the others with the same sums over the plane.
-        values[~off] += np.linalg.lstsq(plane[:, ~off], plane[:, off] @ values[off], rcond=None)[0]
-        values[off] = 0.0
+    weights.data[entries[place < count]] = np.where(off, 0.0, values + change[..., 0])[
+        place < count
+    ]
     return weights

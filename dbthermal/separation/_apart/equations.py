@@ -1,5 +1,6 @@
 """Equations that couple the object signals at both cameras' places, of all pixels; see `joint`."""
 
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any, Final
@@ -230,7 +231,7 @@ def samples(inputs: Inputs, frames: Whole) -> tuple[Floats, Floats]:
     return first, steps
 
 
-def change(inputs: Inputs, loose: Whole, result: xr.Dataset) -> Change:
+def change(inputs: Inputs, loose: Whole, result: xr.Dataset, threads: Executor) -> Change:
     """Change of the reference band's signal to p of loose pixels, smoothed over time.
 
     So smoothed it is that of e_1 u_1(x) and holds little of that of the reflection. Bad pixels have
@@ -240,7 +241,7 @@ def change(inputs: Inputs, loose: Whole, result: xr.Dataset) -> Change:
     displacement = inputs.displacement
     assert displacement is not None
     functions = smooth_functions(inputs.capture)
-    bad = displacement.once("bad", lambda: _bad(inputs))
+    bad = displacement.once("bad", lambda: _bad(inputs, threads))
     at_p = without(displacement.resample[loose], bad, displacement.shape[1])
     unknown = abs(at_p) @ bad > 0.0
     across = displacement.onward[loose]  # at r + d(r), nearly as far from r as p
@@ -272,11 +273,11 @@ def change(inputs: Inputs, loose: Whole, result: xr.Dataset) -> Change:
     return Change(curves, functions.object_part, variance)
 
 
-def _bad(inputs: Inputs) -> Mask:
+def _bad(inputs: Inputs, threads: Executor) -> Mask:
     """Bad pixels (pixel) of the reference band."""
     band = inputs.capture.isel(band=[inputs.bands[0]])
-    status = [quality.read(band.isel(y=rows))[2] for rows in inputs.blocks]
-    return quality.unusable(np.concatenate(status))
+    status = threads.map(lambda rows: quality.read(band.isel(y=rows))[2], inputs.blocks)
+    return quality.unusable(np.concatenate([*status]))
 
 
 def _film(inputs: Inputs, pixels: Whole) -> Floats:

@@ -204,7 +204,7 @@ def solve(
         pooled = material is not None and np.isfinite(material.emissivity).any()
         sampled = frames.nodes if pooled and frames.smooth else looked_at(result.sizes["time"])
         places = equations.solved
-        change = system.change(inputs, equations.ways[relaxation.LOOSE], result)
+        change = system.change(inputs, equations.ways[relaxation.LOOSE], result, threads)
         shares = system.coefficients(inputs, raw, solved)[:, places]
         if maps is not None:
             target, size = _by_maps(inputs, maps, raw, material, result, places)

@@ -51,6 +51,7 @@ def alone(inputs: Inputs, result: xr.Dataset, separate_pixels: Each, threads: Ex
     objects = joint.solve(
         inputs, result, threads, frames, maps=maps, material=material, before=objects, blur=blur
     )
+    del maps  # a large part of the memory
     if objects is not None:
         inputs = replace(inputs, difference=objects.difference)
     if objects is not None or material is not None:
@@ -105,6 +106,7 @@ def pooled(
         if sound.any() and np.median(changes) < _SETTLED:
             break
     inputs = replace(inputs, difference=None if objects is None else objects.difference)
+    del maps, scatters, survey  # a large part of the memory
     separate_pixels(inputs, material)
     if objects is not None:
         objects.finish(result, threads)
