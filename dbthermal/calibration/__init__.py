@@ -135,9 +135,10 @@ class _Signal(NamedTuple):
     std: Array
     bias: Array
 
-    def covariance(self, values: Array) -> Array:
-        """Covariance of the signal, times values (n)."""
-        return np.asarray(self.std**2 * values + self.bias.T @ (self.bias @ values))
+    @property
+    def covariance(self) -> Array:
+        """Covariance (n, n) of the signal [count^2]."""
+        return np.asarray(np.diag(self.std**2) + self.bias.T @ self.bias)
 
 
 class _Signals(NamedTuple):
@@ -152,8 +153,8 @@ class _Signals(NamedTuple):
         """Inverse covariance of the residual y - e x, times values (n)."""
         # s_I^2 + e^2 cov(W_o) + (1 - e)^2 cov(W_b)
         covariance = self.noise**2 * np.eye(values.size)
-        for share, signal in ((emissivity, self.emitted), (1.0 - emissivity, self.reflected)):
-            covariance += share**2 * (np.diag(signal.std**2) + signal.bias.T @ signal.bias)
+        covariance += emissivity**2 * self.emitted.covariance
+        covariance += (1.0 - emissivity) ** 2 * self.reflected.covariance
         return np.asarray(np.linalg.solve(covariance, values))
 
 
@@ -349,8 +350,8 @@ def _fit_band(signals: _Signals, name: str) -> tuple[float, float, float, Array]
         # York et al. (2004): weigh by the abscissa as the fit adjusts it, without its scatter,
         # x - cov(x, r) cov(r)^-1 r with cov(x, r) = -e cov(W_o) + (1 - e) cov(W_b).
         weighted = signals.weighted(emissivity, y - emissivity * x)
-        adjusted = x + emissivity * signals.emitted.covariance(weighted)
-        adjusted = adjusted - (1.0 - emissivity) * signals.reflected.covariance(weighted)
+        adjusted = x + emissivity * signals.emitted.covariance @ weighted
+        adjusted = adjusted - (1.0 - emissivity) * signals.reflected.covariance @ weighted
         weights = signals.weighted(emissivity, adjusted)
         previous, emissivity = emissivity, float((weights @ y) / (weights @ x))
         if abs(emissivity - previous) < _CONVERGED:

@@ -337,15 +337,14 @@ def _check_growth(band: str, temperature: Array, counts: Array, std: float) -> N
 
 
 def _check_residuals(curve: Curve, temperature: Array, counts: Array, std: float) -> None:
-    """Refuse counts farther from their Planck curve than errors of a standard deviation explain.
-
-    The nearest curve of any shape is no farther from the counts than the nearest one of the true
-    shape, whose two linear parameters leave a chi-square of n - 2 degrees of freedom.
-    """
+    """Refuse counts farther from their Planck curve than errors of a standard deviation explain."""
+    # The nearest curve of any shape is no farther from the counts than that of the true shape,
+    # whose two linear parameters leave a chi-square of n - 2 degrees of freedom.
     band, off = curve.band, counts - curve.counts(temperature)
     if np.sum(off**2) <= std**2 * chdtri(counts.size - 2, _FALSE_ALARM):
         return
     explained = f"noise and blackbody explain {std:.3g} count"
+    # Readings without which the others lie on a curve.
     fitting = []
     for place in range(counts.size):
         remaining = np.arange(counts.size) != place

@@ -97,11 +97,7 @@ def _deviations(section: xr.Dataset, valid: Mask) -> dict[str, float]:
 
 
 def by_material(result: xr.Dataset, measured: Mask, table: xr.Dataset) -> list[dict[str, Any]]:
-    """Emissivities of the measured pixels, by the nearest material of a table.
-
-    Pixels that the separation took for one material (`material`) are judged by their median. The
-    commonest first; ``nearest`` is empty where many materials of the table are alike.
-    """
+    """Emissivities of the measured pixels, by the nearest material of a table, commonest first."""
     if not {"emissivity", "emissivity_std"} <= {*result.data_vars}:
         return []
     bands = [str(band) for band in result["band"].values]
@@ -115,7 +111,7 @@ def by_material(result: xr.Dataset, measured: Mask, table: xr.Dataset) -> list[d
     values, stds, drift_stds = values[finite], stds[finite], drift_stds[finite]
     steady_stds = np.sqrt(np.maximum(stds**2 - drift_stds**2, 0.0))
     vague = stds.max(axis=1, initial=0.0) >= _VAGUE
-    # Medians of each label, which tell materials apart that single pixels do not.
+    # Pixels of one label by their median, which tells materials apart that single pixels do not.
     judged, deviations = values.copy(), stds.copy()
     labels = np.full(len(values), -1)
     if "material" in result:
@@ -132,7 +128,7 @@ def by_material(result: xr.Dataset, measured: Mask, table: xr.Dataset) -> list[d
             commonest = np.bincount(first[free]).argmax()
             groups.append(free & (distances[:, commonest] < _ALIKE))
             free = free & ~groups[-1]
-    # Medians of each, and the materials within a deviation.
+    # Medians of each, and the materials within a deviation; none where many are alike.
     listed = []
     for pixels in (pixels for pixels in groups if pixels.sum() >= max(1, _COMMON * len(values))):
         middle, std, steady = (

@@ -135,17 +135,12 @@ def curves(
 
 
 def save(view: View, path: str | Path, shown: Shown) -> None:
-    """Save what is seen, by suffix.
-
-    ``.csv``: curves of the regions in the first pane; ``.tiff``: its frame, 32-bit float in its own
-    units; ``.png``: all panes; ``.nc``: all panes' frames, and the curves; ``.gif``, ``.webp``: the
-    films among them.
-    """
+    """Save what is seen, by suffix: curves, a picture, a film, or the frames with the curves."""
     path, (name, *_), index = Path(path), shown.names, shown.index
     if path.suffix not in SUFFIXES:
         raise ValueError(f"Invalid path '{path}'. Must end in one of {list(SUFFIXES)}.")
     what = {"pane": name, "frame": index, "sources": view.sources}
-    if path.suffix == ".csv":
+    if path.suffix == ".csv":  # curves of the regions in the first pane
         lines = curves(view, name, shown.regions, shown.pixels)
         path.write_text(_table(view, lines, celsius=shown.celsius))
     elif path.suffix in ANIMATED:
@@ -153,11 +148,12 @@ def save(view: View, path: str | Path, shown: Shown) -> None:
     elif path.suffix == ".png":
         store.save_figure(figure(view, shown), path, store.provenance(what))
     elif path.suffix == ".tiff":
+        # The frame of the first pane, 32-bit float in its own units.
         pane = view.pane(name)
         text = f"{pane.label} [{pane.units}] at {view.time[index]:.3f} s"
         tags = {270: text.encode("ascii", "ignore")}  # the description
         Image.fromarray(view.frame(name, index)).save(path, tiffinfo=tags)
-    else:
+    else:  # the frames of all panes, and the curves
         result = xr.Dataset(attrs={"time": float(view.time[index])})
         for pane_name in shown.names:
             units = {"units": view.panes[pane_name].units}

@@ -54,11 +54,9 @@ _IDENTIFIERS = 0x1000  # all documented identifiers of controllers are below
 
 
 class Id(IntEnum):
-    """Messages that a filter wheel needs, and that a controller may send, by the maker's names.
+    """Messages that a filter wheel needs, and that a controller may send, by the maker's names."""
 
-    After ``SET`` comes the number of the request of the same parameters, then that of its reply.
-    """
-
+    # After ``SET`` comes the number of the request of the same parameters, then of its reply.
     HW_REQ_INFO = 0x0005
     HW_GET_INFO = 0x0006
     HW_STOP_UPDATEMSGS = 0x0012  # nothing starts them: some BSC then stop answering after 5 s
@@ -201,12 +199,7 @@ def text(raw: bytes) -> str:
 
 
 def encode(message: Message) -> bytes:
-    """Bytes of a message to send; with data in the long form, which has no parameters.
-
-    A controller silently ignores messages to another destination than its own; a channel is 1 in
-    every bay of a rack. ValueError if a number is not whole, or does not fit its field, or the data
-    are too long, or have a length that messages of this `Id` never have.
-    """
+    """Bytes of a message to send; ValueError if a number or the data do not fit their fields."""
     size, lengths = len(message.data), LENGTHS.get(message.id)
     if lengths is not None and size not in lengths:
         name = Id(message.id).name
@@ -214,6 +207,7 @@ def encode(message: Message) -> bytes:
     if size > _LONGEST or message.destination & _HAS_DATA:
         rule = f"Must have at most {_LONGEST} bytes of data, and a destination below {_HAS_DATA}"
         raise ValueError(f"Invalid {message}. {rule}.")
+    # The long form, with data, has no parameters.
     if size and (message.param1 or message.param2):
         raise ValueError(f"Invalid {message} with data. Its parameters must be 0.")
     if not size:
@@ -226,32 +220,29 @@ def encode(message: Message) -> bytes:
 class Decoder:
     """Finds the messages in a stream of bytes, however it is cut into pieces.
 
-    A byte with which no possible message begins is dropped and counted, and the search goes on with
-    the next. Each received byte belongs to a message that was returned, is counted in `dropped`, or
-    is `pending`. The fewer `destinations` and `sources` are possible, the less noise passes for a
-    message; by default all are, so that a line is read in both directions.
+    Each received byte belongs to a message that was returned, is counted in `dropped`, or is
+    `pending`.
     """
 
+    # The fewer are possible, the less noise passes for a message; by default both directions.
     destinations: Collection[int] = CONTROLLERS | {HOST}
     sources: Collection[int] = CONTROLLERS | {HOST}
     dropped: int = field(default=0, init=False)
     pending: bytearray = field(default_factory=bytearray, init=False)  # beginning of a message
 
     def feed(self, received: bytes) -> list[Message]:
-        """Messages that the next bytes of the stream complete.
-
-        A message that is well formed but not in `Id` is returned whole, so that nothing in its data
-        is taken for a message. A message of `Id` with a length that it never has is noise.
-        """
+        """Messages that the next bytes of the stream complete."""
         self.pending += received
         messages, start = [], 0
         while len(self.pending) - start >= _HEADER:
             identifier, size, destination, source = _LONG.unpack_from(self.pending, start)
             # The long form, with the length of its data, is marked in the destination.
             is_long, address = bool(destination & _HAS_DATA), destination & ~_HAS_DATA
+            # A message that is not in `Id` may have any length: nothing in its data is a message.
             size, every = size if is_long else 0, range(_LONGEST + 1)
             sizes = LENGTHS.get(identifier, every if identifier < _IDENTIFIERS else ())
             possible = address in self.destinations and source in self.sources
+            # With this byte begins no message.
             if not possible or size not in sizes or bool(size) != is_long:
                 start, self.dropped = start + 1, self.dropped + 1
                 continue
@@ -333,16 +324,13 @@ class Controller:
     def request(
         self, identifier: Id, unit: int = 0, channel: int = CHANNEL, *, attempts: int = ATTEMPTS
     ) -> Message:
-        """Reply to a request, of the motor by default, of any channel if 0; or NoReplyError.
-
-        Only requests are repeated, never what moves the wheel. What came before is not the reply; a
-        late one may be taken for that of the repetition, and is older than it seems, but replies
-        stay in order.
-        """
+        """Reply to a request, of the motor by default, of any channel if 0; or NoReplyError."""
         unit, reply = unit or self.motor, Id(identifier + 1)
         request = encode(Message(identifier, channel, 0, unit))
         with self._clock.hold(self._lock):
+            # Only requests are repeated, never what moves the wheel.
             for _ in range(attempts):
+                # What came before is no reply; a late one may count as that of the repetition.
                 self._collect()
                 self._transport.write(request)
                 deadline = self._clock() + REPLY_TIMEOUT

@@ -4,9 +4,8 @@ A frame of the serial line (FSLP) is the start byte 8E, then channel, sequence n
 status, data and checksum, big-endian and with three byte values escaped, then the end byte AE.
 
 A busy camera answers late; without sequence numbers every later command then gets the reply of the
-command before (openmv/openmv, pull request 3265). Here each request has a new number, and frames
-without it are discarded. Connecting sends and resets nothing, and nothing is ever written to the
-camera's flash memory. `KIND` opens camera and command port for a session.
+command before (openmv/openmv, pull request 3265). Here each request has a new number. Connecting
+sends and resets nothing, and nothing is ever written to the camera's flash memory.
 
 References
 ----------
@@ -175,14 +174,12 @@ def checksum(content: bytes) -> int:
 
 
 def encode(frame: Packet) -> bytes:
-    """Bytes of a frame; header, data and checksum are all escaped.
-
-    ValueError if the data are too long, struct.error if a number does not fit its field.
-    """
+    """Bytes of a frame; ValueError or struct.error if data or a number do not fit their field."""
     if (size := len(frame.data)) > MAXIMUM_DATA:
         raise ValueError(f"Invalid data of {size} bytes. Must be at most {MAXIMUM_DATA}.")
     content = _HEADER.pack(frame.channel, frame.sequence, frame.command, frame.status) + frame.data
     content += _CHECKSUM.pack(checksum(content))
+    # Header, data and checksum are all escaped.
     pieces = (_ESCAPE + bytes((v - _SHIFT,)) if v in _SPECIAL else bytes((v,)) for v in content)
     return _START + b"".join(pieces) + _END
 
@@ -198,15 +195,10 @@ def next_sequence(sequence: int) -> int:
 
 
 class Decoder:
-    """Finds the frames in a stream of bytes, however it is cut into pieces.
-
-    Bytes between frames are ignored. A start byte always begins anew. A frame that is cut short,
-    too long or too short, holds an illegal escape or has the wrong checksum is dropped and counted
-    in `damaged`: each start byte began a frame that was returned, is counted, or is still open.
-    """
+    """Finds the frames in a stream of bytes, however it is cut into pieces."""
 
     def __init__(self) -> None:
-        self.damaged = 0
+        self.damaged = 0  # dropped frames: cut, too long or short, wrong escape or checksum
         self._content: bytes | None = None  # since the last start byte; None between frames
 
     @property
@@ -218,7 +210,7 @@ class Decoder:
         """Take in any number of bytes; return the undamaged frames that they complete."""
         frames = []
         for number, piece in enumerate(bytes(received).split(_START)):
-            if number:  # a start byte came before it
+            if number:  # a start byte came before it, and begins anew
                 self.damaged += self.is_open
                 self._content = b""
             if self._content is None:
@@ -417,6 +409,5 @@ class Boson(Closing):
 
 
 # Of a session's ``kind: boson``.
-KIND: Final = CameraKind(
-    partial(v4l2.open_url, decode=telemetry.metadata), Boson, BAUDRATE, (0, telemetry.ROWS)
-)
+_OPEN_FRAMES = partial(v4l2.open_url, decode=telemetry.metadata)
+KIND: Final = CameraKind(_OPEN_FRAMES, Boson, BAUDRATE, (0, telemetry.ROWS))

@@ -152,10 +152,7 @@ class FrameSource(Protocol):
         """Clock of the times of arrival."""
 
     def read(self, timeout: float = FRAME_TIMEOUT) -> Frame:
-        """Wait at most `timeout` [s] for the next frame; damaged ones come with flags.
-
-        `NoFrameError` if none came in time, `SourceLostError` if the camera is gone or closed.
-        """
+        """Wait at most `timeout` [s] for a frame; `NoFrameError` or `SourceLostError` without."""
 
     def close(self) -> None:
         """Stop and release the device; a second call does nothing."""
@@ -219,26 +216,19 @@ def next_shutter(
 ) -> Shutter:
     """State of a camera's shutter after the next frame, from telemetry, serial line and image.
 
-    A camera freezes its image while the shutter is closed. A frame counts as closed if
-
-    - its telemetry says that the offsets were renewed since the frame before, at the start or at
-      the end of the correction. This costs a frame more than needed, but finds every renewal, even
-      where the frozen frames were lost; or
-    - it repeats the image, and the frame before counted as closed, or the serial line says that a
-      correction is imminent or in progress. That reading is older than the frame, so it does not
-      count against an image that changes; or
-    - it is the third copy in a row or later, of a camera without telemetry; fewer copies are lost
-      frames. The serial line may miss an event: it is read once a second, and stalls meanwhile.
-
-    The flag need not begin at the first copy: `dbthermal.correction.find_shutter` makes one event
-    with renewed offsets of every run of copies that holds or touches a flagged frame.
-    `last_ffc_frame` is None without telemetry, or if the frame is damaged, and `ffc_status` without
-    a reading of the serial line, or if it is too old.
+    A camera freezes its image while the shutter is closed. The flag need not begin at the first
+    copy: `dbthermal.correction.find_shutter` makes one event of every run of copies that holds or
+    touches a flagged frame. What is not known of the frame is None.
     """
+    # By telemetry the offsets were renewed since the frame before. This costs a frame more than
+    # needed, but finds every renewal, even where the frozen frames were lost.
     latest = before.last_ffc_frame if last_ffc_frame is None else last_ffc_frame
     renewed = before.last_ffc_frame not in {None, latest}
-    copies = before.copies + 1 if repeated else 0
+    # The serial line says so: older than the frame, it counts against no image that changes.
     announced = ffc_status in {FfcStatus.IMMINENT, FfcStatus.IN_PROGRESS}
+    # The third copy in a row, without telemetry; fewer are lost frames. The serial line, which is
+    # read once a second, may miss an event.
+    copies = before.copies + 1 if repeated else 0
     frozen = latest is None and copies >= FEWEST_COPIES
     closed = renewed or (repeated and (before.closed or announced or frozen))
     return Shutter(closed, copies, latest)

@@ -104,10 +104,9 @@ class Devices:
             camera.run_ffc()
 
     def select(self, band: str) -> "Devices":
-        """Turn one of the session's filters into the beam; as `FilterWheel.select`.
+        """Turn a filter into the beam; the devices with the camera behind it named after its band.
 
-        Returns the devices with the camera behind the wheel named after this band; ValueError if
-        the session has no wheel, or no such filter.
+        ValueError if the session has no wheel, or no such filter; else as `FilterWheel.select`.
         """
         before = self.session.filtered
         if self.wheel is None or before is None:

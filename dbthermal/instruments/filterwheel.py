@@ -5,11 +5,10 @@ bare stepper stage, not to be confused with the FW102C and FW212C, which speak A
 encoder: its position is a count of commanded steps. A controller that stops short of its target, or
 never starts, is an error here; steps lost under way are not detected until `FilterWheel.home`.
 
-A controller that was just switched on may have speeds near 0 and a motor without current, and one
-that was sold under one name may give another: the model is checked, and each setting read back. A
-motion is over when the controller reports its end or the moving bits are clear, and the wheel is
-where it should be. Neither is enough alone: bits were seen to stick, the report of an earlier move
-may come late, and before a move starts the bits are clear too.
+A controller that was just switched on may have speeds near 0 and a motor without current: each
+setting is read back. A motion is over when the controller reports its end or the moving bits are
+clear, and the wheel is where it should be. Neither is enough alone: bits were seen to stick, the
+report of an earlier move may come late, and before a move starts the bits are clear too.
 
 References
 ----------
@@ -55,10 +54,7 @@ CONFIRMATIONS: Final = 2  # status replies that must agree before a motion is ov
 
 
 class StatusBits(IntFlag):
-    """State of a motor: the bits that a filter wheel needs; the rest are kept as they come.
-
-    Bit 12 is read as "tracking" by some and as "interlock" by others, and has no name here.
-    """
+    """State of a motor: the bits that a filter wheel needs; the rest are kept as they come."""
 
     MOVING_FORWARD = 1 << 4
     MOVING_REVERSE = 1 << 5
@@ -67,6 +63,7 @@ class StatusBits(IntFlag):
     CONNECTED = 1 << 8
     HOMING = 1 << 9
     HOMED = 1 << 10
+    # Bit 12 is read as "tracking" by some and as "interlock" by others.
     POSITION_ERROR = 1 << 14
     OVERLOAD = 1 << 24
     ENABLED = 1 << 31
@@ -109,12 +106,10 @@ class Scale:
     acceleration: float  # device units of one count/s^2
 
     def target(self, position: int, offset: float) -> int:
-        """Absolute place [count] of a slot, 1 to 6; `offset` [deg] is that of slot 1 after homing.
-
-        Each place is rounded by itself, so that errors never add up. ValueError for any other slot.
-        """
+        """Absolute place [count] of a slot, 1 to 6, or ValueError; offset of slot 1 [deg]."""
         if position not in range(1, POSITIONS + 1):
             raise ValueError(f"Invalid filter position {position}. Must lie in 1 to {POSITIONS}.")
+        # Each place is rounded by itself, so that errors never add up.
         return round(((position - 1) / POSITIONS + offset / 360.0) * self.turn)
 
     def position(self, count: float, offset: float, tolerance: float = TOLERANCE) -> int | None:
@@ -163,10 +158,7 @@ class FilterWheel(Closing):
         self._is_lost = False  # the counter may not be where the wheel is
 
     def connect(self) -> None:
-        """Find the controller, check its identity, set the speeds and enable the motor.
-
-        The wheel does not move.
-        """
+        """Find and check the controller, set the speeds, enable the motor; nothing moves."""
         info, expected = self._controller.connect(), self.settings.serial_number
         model = apt.text(info.model)
         if expected is not None and info.serial_number != expected:
@@ -197,11 +189,7 @@ class FilterWheel(Closing):
         return apt.parse(apt.Status, self._controller.request(Id.MOT_REQ_STATUSUPDATE))
 
     def home(self) -> None:
-        """Search for the home switch, from which all places count; the speeds are set before.
-
-        StalledWheelError if the wheel does not start, or stops before the switch; WheelError if it
-        takes too long, and was stopped.
-        """
+        """Search for the home switch, from which all places count; raises as `move_to`."""
         self.identity()
         self._prepare()
         self._resting(homed=False)
@@ -215,12 +203,11 @@ class FilterWheel(Closing):
         self._is_lost = False
 
     def move_to(self, position: int) -> None:
-        """Turn a slot, 1 to 6, into the beam, and confirm that it is there.
+        """Turn a slot, 1 to 6, into the beam, and confirm that it is there; ValueError for another.
 
-        ValueError if there is no such slot; NotHomedError if the controller was not homed since it
-        was switched on, or steps may be lost since; StalledWheelError if the wheel does not move,
-        stops elsewhere, or the controller reports a fault: it must be homed before the next move;
-        WheelError if it takes too long, and was stopped.
+        NotHomedError if the controller was not homed since it was switched on, or lost steps since;
+        StalledWheelError, after which it must be homed, if the wheel does not move, stops elsewhere
+        or has a fault; WheelError if it takes too long, and was stopped.
         """
         scale = self._scale
         target = scale.target(position, self.settings.home_offset)
@@ -322,11 +309,8 @@ class FilterWheel(Closing):
     def _follow(
         self, name: str, end: Id, limits: tuple[float, float], goal: Callable[[apt.Status], bool]
     ) -> None:
-        """Poll until a motion is over; raise if it fails, with the wheel stopped if it moves.
-
-        `limits` are the longest motion, and the longest time at one place [s]. At its end the state
-        is the goal; in a search for home the wheel must have moved.
-        """
+        """Poll until a motion is at its goal; raise if it fails, with a moving wheel stopped."""
+        # Limits are the longest motion, and the longest time at one place [s].
         start = changed = self._clock()
         moved, rests, confirmed, count = False, 0, 0, None
         while confirmed < CONFIRMATIONS:
@@ -342,7 +326,7 @@ class FilterWheel(Closing):
             if status.position != count:
                 count, changed = status.position, now
             rests = 0 if moving else rests + 1
-            # Over, by its end and its place.
+            # Over, by its end and its place; in a search for home the wheel must have moved.
             rested = rests > 0 and (moved or end is not Id.MOT_MOVE_HOMED)
             ended = rested or end in self._controller.ended
             confirmed = confirmed + 1 if ended and goal(status) else 0

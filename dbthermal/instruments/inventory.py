@@ -21,15 +21,12 @@ __dir__ = __all__.copy
 
 
 class Kind(NamedTuple):
-    """Type of device: name, USB identity, and its families of nodes.
-
-    A family of nodes has a name, the Linux module that makes it, and where sysfs lists its nodes.
-    """
+    """Type of device: name, USB identity, and its families of nodes."""
 
     name: str
     vendor: int
     product: int
-    families: tuple[tuple[str, str, str], ...] = ()
+    families: tuple[tuple[str, str, str], ...] = ()  # name, Linux module, place in sysfs
 
 
 # 09cb:4007 after FLIR/UVC-Boson and flirpy; 0403:faf0, an FTDI chip with Thorlabs's identity, after
@@ -83,9 +80,8 @@ def find(
 ) -> list[Device]:
     """List the rig's devices that are plugged in, in the order of `KINDS`, then of bus and ports.
 
-    By default with the libusb that is installed and Linux's trees of devices and nodes; all are
-    replaced in tests. The cameras' frame rate [Hz] is for the bandwidth. LibusbMissingError without
-    a libusb, usb.core.USBError if the bus cannot be listed.
+    The cameras' frame rate [Hz] is for the bandwidth. LibusbMissingError without a libusb,
+    usb.core.USBError if the bus cannot be listed.
     """
     devices = []
     for kind in KINDS:

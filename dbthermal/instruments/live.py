@@ -1,10 +1,8 @@
 """Live view of a recording: its pictures, its losses, and the state of its cameras.
 
-A `View` is passed to `dbthermal.instruments.recording.record` as `preview`, and shows a picture of
-each band, in place, in a notebook or nowhere. With a `Separation` it shows the temperatures of
-object and background beside them. A `Watch` computes the numbers that are shown, and draws nothing:
-matplotlib is loaded with the first picture. The queue of the recording has to bridge the time that
-an update takes.
+A `View` is passed to `dbthermal.instruments.recording.record` as `preview`; with a `Separation` it
+shows the temperatures of object and background as well. A `Watch` computes the numbers that are
+shown, and draws nothing. The queue of the recording bridges the time that an update takes.
 """
 
 import io
@@ -215,10 +213,8 @@ class View:
     """Live view: an instance is the `preview` of a recording, or of several.
 
     It is shown on a `display`, such as IPython's ``DisplayHandle``, first by its ``display``, then
-    by its ``update``; without one the figure is only kept. An update, once a second at most, of two
-    bands of 640 x 512 takes a fifth of a second of one core. `title` is the recording's name. With
-    a `separation` it shows temperatures as well. `figure` is the last one that was drawn, None
-    before the first preview.
+    by its ``update``; without one the last `figure` is only kept. An update, once a second at most,
+    of two bands of 640 x 512 takes a fifth of a second of one core.
 
     Examples
     --------

@@ -194,12 +194,10 @@ def record_scene(
 
 
 def _record(devices: Devices, path: Path, *, begins: bool = False, **options: Any) -> Summary:
-    """Record all sources and readings of open devices, with the options of `recording.record`.
-
-    An emulated scene begins with the recording, or stands.
-    """
+    """Record all sources and readings of open devices, with the options of `recording.record`."""
     options |= {"readings": devices.readings(), "identities": devices.identities()}
     devices.flush()
+    # An emulated scene begins with the recording, or stands.
     if begins and devices.world is not None:
         devices.world.begin()
     return recording.record(devices.session, devices.sources, path, **options)

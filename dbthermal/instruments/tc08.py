@@ -149,10 +149,7 @@ class TC08(Closing):
 
     @classmethod
     def from_url(cls, url: str = "tc08:") -> Self:
-        """Load the vendor's library and open the first free unit, at the address ``tc08:``.
-
-        ValueError if it is another address; else the errors of `load` and `open`.
-        """
+        """Load the vendor's library and open the first free unit, at the address ``tc08:``."""
         parse(url, "tc08")
         return cls(load()).open()
 
@@ -209,10 +206,9 @@ class TC08(Closing):
         }
 
     def set_channels(self, channels: Mapping[int, str]) -> None:
-        """Set the channels that have a thermocouple, of type T, 1 to 8, and the places of the tips.
+        """Set the channels, 1 to 8, that have a thermocouple of type T, and the places of the tips.
 
-        All others are off, but the cold junction. ValueError for another channel, or none;
-        TC08Error or RuntimeError if the library fails, or the unit is not open.
+        ValueError for another channel, or none; TC08Error or RuntimeError if the library fails.
         """
         if not channels:
             raise ValueError("Invalid channels. Must be one at least.")
@@ -228,11 +224,8 @@ class TC08(Closing):
         self.channels = dict(channels)
 
     def read(self, channel: int) -> float:
-        """Temperature of a channel [K], never the same measurement twice; a scan serves all.
-
-        `ReadingError` if it is no temperature; else the errors of `single`.
-        """
-        # A scan is used while it is new, and once by each channel.
+        """Temperature of a channel [K]; `ReadingError` if it is none, else as `single`."""
+        # A scan serves all channels: it is used while it is new, and once by each.
         with self.clock.hold(self._lock):
             scan = self._scan
             if scan is None or channel in self._used or self.clock() - scan.time > SCAN_AGE:
@@ -247,13 +240,11 @@ class TC08(Closing):
         return temperature
 
     def single(self) -> Scan:
-        """Read all channels once; it takes 0.2 s for one thermocouple, 0.9 s for eight.
-
-        TC08Error or RuntimeError if the library fails, the unit is closed, or no channels are set.
-        """
+        """Read all channels once; TC08Error or RuntimeError if the library fails, or is closed."""
         if self._handle and not self.channels:
             raise RuntimeError("The TC-08 has no channels yet. Must be set by set_channels first.")
         values, overflow = (c_float * CHANNELS)(), (c_int16 * 1)()
+        # It takes 0.2 s for one thermocouple, 0.9 s for eight.
         start = self.clock()
         self._call("get_single", "take a single reading", values, overflow, KELVIN)
         middle = 0.5 * (start + self.clock())
@@ -275,11 +266,8 @@ class TC08(Closing):
 
 
 def load() -> Library:
-    """Load the vendor's library and declare the types of its functions.
-
-    The variable `ENVIRONMENT`, or the system's search for ``usbtc08``, names the file
-    (FileNotFoundError without any). OSError if it cannot be loaded, or lacks a function.
-    """
+    """Load the vendor's library and declare its types; OSError if it is missing, or another."""
+    # The variable, or the system's search, names the file.
     name = os.environ.get(ENVIRONMENT) or ctypes.util.find_library("usbtc08")
     if name is None:
         raise FileNotFoundError(

@@ -1,12 +1,10 @@
 """Telemetry rows of a Boson: values that the camera writes beside the image.
 
-With telemetry on, the 640 x 512 image comes with two more rows on USB. The layout is **likely, not
-certain**: public decoders that do not depend on one another agree on it (Elphel's
-``Boson640Telemetry.java``, the Python class ``BosonWithTelemetry``, belivan/flir_stereo
-``flir_ros_sync.cpp``), and none of them is the vendor's. The same holds for the orders: each 16-bit
-word is little-endian, and of a longer number the high word comes first. Therefore a recording keeps
-the rows as they came. The meaning of the status bits is not public: the shutter follows from
-`last_ffc_frame` and the serial line, see `camera.next_shutter`.
+With telemetry on, the 640 x 512 image comes with two more rows on USB. The layout, and the order of
+words, is **likely, not certain**: public decoders that do not depend on one another agree on it
+(Elphel's ``Boson640Telemetry.java``, the Python class ``BosonWithTelemetry``, belivan/flir_stereo
+``flir_ros_sync.cpp``), and none of them is the vendor's. Each 16-bit word is little-endian, and of
+a longer number the high word comes first. The meaning of the status bits is not public.
 """
 
 from collections.abc import Mapping
@@ -66,11 +64,8 @@ _ROW = np.dtype(
 
 
 def decode(rows: Counts) -> dict[str, float]:
-    """Read the value of each of `FIELDS` from telemetry rows, uint16 (row, x) or (word,).
-
-    Any content is read as if it were telemetry: there is no checksum. TypeError or ValueError if
-    the rows are not of uint16, or hold fewer than `WORDS` words.
-    """
+    """Read each of `FIELDS` from telemetry, uint16 (row, x) or (word,), of `WORDS` or more."""
+    # There is no checksum: any content is read as if it were telemetry.
     (numbers,) = _checked(rows)[:WORDS].astype(">u2").view(_ROW).tolist()
     return {
         name: number / field.steps + field.zero if field.steps else number
@@ -86,10 +81,7 @@ def metadata(rows: Counts) -> Metadata:
 
 
 def encode(values: Mapping[str, float], columns: int, rows: int = ROWS) -> Counts:
-    """Write fields as telemetry (rows, columns), 0 elsewhere, as an emulated camera does.
-
-    ValueError if these are too few, or a value does not fit its field.
-    """
+    """Write fields as telemetry (rows, columns), 0 elsewhere; ValueError if they do not fit."""
     words, row = _checked(np.zeros(rows * columns, dtype=np.uint16)), np.zeros(1, _ROW)
     for name, value in values.items():
         field = FIELDS[name]

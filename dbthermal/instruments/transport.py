@@ -95,10 +95,7 @@ class Clock:
 
     @contextmanager
     def joined(self, entered: threading.Event | None = None) -> Iterator[None]:
-        """Let this thread take part in the order of a clock that has an order.
-
-        The event is for a new thread: it is set when the thread has its place in the order.
-        """
+        """Let this thread take part in an order; a new one sets its event when it does."""
         if entered is not None:
             entered.set()
         yield
@@ -198,11 +195,8 @@ class EmulatedClock(Clock):
 
     @contextmanager
     def joined(self, entered: threading.Event | None = None) -> Iterator[None]:
-        """Take part in the order while a block lasts.
-
-        The thread runs now; a new one, with an event, after all that wait.
-        """
-        # A place in the order.
+        """Take part in the order while a block lasts; see `Clock.joined`."""
+        # A place in the order: now, or, of a new thread, after all that wait.
         turn = _Wait(lambda: True, self._now)
         with self._lock:
             is_member = turn.thread in self._members
@@ -274,10 +268,7 @@ def parse(url: str, scheme: str) -> str:
 
 
 class Closing:
-    """Context manager that closes at its end, without hiding an error inside it.
-
-    A failure to close becomes a note of that error; it is raised only if there is none.
-    """
+    """Context manager that closes at its end; a failure of that hides no error inside it."""
 
     def close(self) -> None:
         """Release the device; a second call does nothing."""

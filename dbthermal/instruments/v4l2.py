@@ -5,9 +5,8 @@ A thin use of Video4Linux2, in ten calls; numbers, sizes and layouts are those o
 frame is on CLOCK_MONOTONIC. That of uvcvideo claims to be of the start of the exposure; likely,
 unless that module is told to use the camera's clock, it is of the frame's first packet.
 
-`KIND` is a camera without command port or telemetry: nothing is known of it but its frames. The
-state of its shutter follows from frozen images, see `camera.next_shutter`, and it corrects its
-offsets when it decides to.
+`KIND` is a camera without command port or telemetry: the state of its shutter follows from frozen
+images, see `camera.next_shutter`.
 """
 
 import errno
@@ -244,10 +243,7 @@ def _buffer(index: int) -> tuple[int, ...]:
 
 
 def open_url(url: str, stream: Stream, decode: Decode | None = None) -> Capture:
-    """Open the node of an address ``v4l2:///dev/video0``.
-
-    ValueError if the address is of another kind; OSError on another system than Linux.
-    """
+    """Open the node of an address ``v4l2:///dev/video0``, on Linux; ValueError or OSError."""
     node = parse(url, "v4l2")
     if not sys.platform.startswith("linux"):
         raise OSError(f"No video on '{sys.platform}'. Must be Linux, for V4L2.")

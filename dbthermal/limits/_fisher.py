@@ -146,13 +146,10 @@ def deviations(
     *,
     emissivity_std: float = np.inf,
 ) -> dict[str, Array]:
-    """Smallest standard deviations of `QUANTITIES`, with ratios over the reference band.
-
-    Temperatures (time, pixel) [K], emissivity and ratios (band, pixel) [1]; infinite where the
-    capture holds no information. A prior deviation of 0 means known emissivities.
-    """
+    """Smallest deviations of `QUANTITIES`, (time, pixel) [K] or (band, pixel) [1]; or infinite."""
     frames, pixels = sensitivity.resting.shape
     bands = len(sensitivity.emissivity)
+    # A prior deviation of 0 means known emissivities.
     is_known = emissivity_std == 0
     if is_known:
         sensitivity = replace(sensitivity, contrast=np.zeros_like(sensitivity.contrast))
@@ -177,7 +174,7 @@ def _blocks(pixels: Indices) -> list[Indices]:
 def _deviations(
     sensitivity: Sensitivity, functions: Array, reference: int, prior: float
 ) -> dict[str, Array]:
-    """Deviations of pixels of one order."""
+    """Deviations of pixels of one order, for functions (time, order) and 1 / prior variance."""
     emissivity = sensitivity.emissivity
     bands, (frames, order) = len(emissivity), functions.shape
     inverse = fisher_inverse(sensitivity, functions, prior)
@@ -237,11 +234,7 @@ class FisherInverse:
 
 
 def fisher_inverse(sensitivity: Sensitivity, functions: Array, prior: float = 0.0) -> FisherInverse:
-    """Inverse information about emissivities (band), object (order) [K] and resting level [K].
-
-    The functions (time, order) are the object's smooth subspace; the prior is the information about
-    each emissivity from elsewhere, one over its variance [1].
-    """
+    """Inverse information about emissivities (band), object (order) [K] and resting level [K]."""
     # Over the samples, g = dz/de, p = dz/dx, v = dz/dy and w = v in the frames at rest, else 0.
     g, p = sensitivity.contrast, sensitivity.emission
     w = sensitivity.reflection * sensitivity.resting

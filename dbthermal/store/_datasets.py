@@ -41,21 +41,19 @@ _DECODED: Final = {"_FillValue", "missing_value", "scale_factor", "add_offset"} 
 def _chunks(
     variable: xr.Variable | xr.DataArray, height: int | None = None, length: int | None = None
 ) -> tuple[int, ...]:
-    """Chunk sizes for a variable: pieces of rows, whole in every dimension but y and x.
-
-    Every stage works pixel by pixel on all frames and bands, and reads rows of the image: a chunk
-    is the fewest whole rows that have `_CHUNK_BYTES` before compression, or equal parts of one, for
-    long runs of memory. Chunks divide a `height` and `length`, so that a next part begins one.
-    """
+    """Chunk sizes for a variable: pieces of rows, whole in every dimension but y and x."""
+    # Every stage works pixel by pixel on all frames and bands, and reads rows of the image.
     sizes = {str(dim): max(1, size) for dim, size in variable.sizes.items()}
     for dim, size in (("y", height), ("x", length)):
         sizes |= {dim: size} if size and dim in sizes else {}
     if not {"y", "x"} <= sizes.keys():
         return tuple(sizes.values())
+    # The fewest whole rows that have the bytes before compression, or equal pieces of one row.
     pixel_bytes = variable.dtype.itemsize * math.prod(sizes.values()) // (sizes["y"] * sizes["x"])
     pixels = math.ceil(_CHUNK_BYTES / pixel_bytes)
     width = math.ceil(sizes["x"] / max(1, sizes["x"] // pixels))
     rows = min(sizes["y"], math.ceil(pixels / width))
+    # Chunks divide a height and a length, so that the next block of rows begins one.
     if length:
         width = next(count for count in range(width, length + 1) if length % count == 0)
     if height:
@@ -113,16 +111,7 @@ def save_rows(
         Rows of each block, by default of the first, and columns of each folder for `join_parts`
         along x; all folders have the same, only the last may have fewer.
 
-    Examples
-    --------
-    >>> import xarray as xr
-    >>> from tempfile import TemporaryDirectory
-    >>> from dbthermal import store
-    >>> rows = (xr.Dataset({"status": (("y", "x"), [[row, 0]])}) for row in range(3))
-    >>> with TemporaryDirectory() as folder:
-    ...     store.save_rows(rows, f"{folder}/wall.zarr", store.provenance({}))
-    ...     store.open_dataset(f"{folder}/wall.zarr").status.values.tolist()
-    [[0, 0], [1, 0], [2, 0]]
+    See the example of `join_parts`.
     """
     following = iter(blocks)
     if (first := next(following, None)) is None:
@@ -167,10 +156,8 @@ def _save(
 
 
 def chunks_in_turn() -> AbstractContextManager[Any]:
-    """Context in which chunks are read and written one after another, for a process of one core.
-
-    There zarr's threads would wait for each other, for a fifth of the time of writing.
-    """
+    """Context in which chunks are read and written one after another, for a process of one core."""
+    # There zarr's threads would wait for each other, for a fifth of the time of writing.
     context: AbstractContextManager[Any] = zarr.config.set({"async.concurrency": 1})
     return context
 

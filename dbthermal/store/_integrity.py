@@ -61,11 +61,7 @@ class SummedStore(LocalStore):
 
 
 class CheckedStore(SummedStore):
-    """Zarr store in a folder, to be read: all that differs from what was written is a ValueError.
-
-    `attrs` are those of the store; of a recording that is not `closed` only the valid part counts,
-    without `time`. A store without checksums, of dbthermal 0.1.0, opens with a warning.
-    """
+    """Zarr store in a folder, to be read; all that is not as it was written is a ValueError."""
 
     def __init__(self, root: Path | str, *, read_only: bool = True) -> None:  # noqa: ARG002 - zarr's
         super().__init__(root, read_only=True)
@@ -88,8 +84,9 @@ class CheckedStore(SummedStore):
             raise ValueError(f"Invalid store '{self.root}', an array. {rule}.")
         mark = {name: self.attrs[name] for name in MARK if name in self.attrs}
         self.closed = mark != GROWING if mark else bool(self.attrs.get("closed", True))
+        # Of a recording that is not closed the valid part counts, without its time.
         self.hidden = () if self.closed else (TIME,)
-        # The list of files, unless the store is of a version without one.
+        # The list of files, unless the store is of version 0.1.0, without one.
         if mark and not self._sums:
             raise ValueError(f"Missing {self._named(SUMS)}. {AS_WRITTEN}")
         if self._sums:
@@ -124,12 +121,10 @@ class CheckedStore(SummedStore):
         raise ValueError(f"{state} {self._named(key)}. {AS_WRITTEN}")
 
     def _check_files(self, group: tuple[str, str]) -> None:
-        """ValueError if a file is missing, or foreign to a store that grows no more.
-
-        Of a store that grows, all files were on the disk whose lines precede that of its `group`.
-        """
+        """ValueError if a file is missing, or foreign to a store that grows no more."""
         files, listed = files_of(self.root), {key for key, _ in self._sums}
         wanted = listed
+        # Of a store that grows, all files were on the disk whose lines precede that of its group.
         if not self.closed:
             wanted = {key for key, _ in takewhile(lambda line: line != group, self._sums)}
         if missing := sorted(wanted - files):

@@ -123,10 +123,7 @@ class Recording:
             raise
 
     def append(self, band: str, block: Mapping[str, Values]) -> None:
-        """Write a chunk of frames of one band behind its others; valid with the next `commit`.
-
-        `block` holds every variable of frames, (frame, ...): a whole chunk, or at last less.
-        """
+        """Write a chunk (frame, ...) of a band behind its others; valid with the next `commit`."""
         with self._held():
             place = list(self.frames).index(band)
             self.frames[band] = self._write(block, (place,), self.frames[band], self.chunk)
@@ -171,14 +168,11 @@ class Recording:
             self._store.replace(integrity.GROUP, json.dumps(content, allow_nan=False).encode())
 
     def close(self, *, complete: bool = True, time: Values | None = None, **attrs: Any) -> None:
-        """Bring all bands to one number of frames, once, with `time` [s] as coordinate.
-
-        A band with fewer frames than another gets copies of its last one, without stamps.
-        """
+        """Bring all bands to one number of frames, once, with `time` [s] as coordinate."""
         if self._closed:
             return
         with self._held():
-            # All bands in as many frames as the longest, all arrays without empty room.
+            # As many frames as the longest band has, by copies of the last one, without stamps.
             self.commit()
             frames = max(self.frames.values())
             for place, recorded in enumerate(self.frames.values()):
@@ -186,6 +180,7 @@ class Recording:
                     last = np.asarray(self._arrays["counts"][place, recorded - 1])
                     copies = np.broadcast_to(last, (frames - recorded, *last.shape))
                     self._write({"counts": copies}, (place,), recorded, self.chunk)
+            # All arrays without empty room.
             for array in self._arrays.values():
                 valid, dims = {"time": frames, "log": self.rows}, array.metadata.dimension_names
                 sizes = zip(dims, array.shape, strict=True)
@@ -254,10 +249,7 @@ class HeldFolder:
 
 
 class DurableStore(integrity.SummedStore):
-    """Zarr store in a folder in which an existing file is replaced in one step.
-
-    New files are brought to the disk by `tree_to_disk`, for many at once take the time of one.
-    """
+    """Zarr store in a folder in which an existing file is replaced in one step."""
 
     def __init__(self, root: Path) -> None:
         super().__init__(root)
@@ -270,7 +262,7 @@ class DurableStore(integrity.SummedStore):
             self.replace(key, value.to_bytes())
         elif key in self._written:
             raise FileNotFoundError(errno.ENOENT, "Deleted while it was written to", str(path))
-        else:
+        else:  # brought to the disk by `tree_to_disk`: many at once take the time of one
             super().set_sync(key, value)
         self._written.add(key)
 

@@ -216,17 +216,13 @@ def _reasons(path: Path, folder: Path) -> Iterator[None]:
 
 
 def replace(path: Path, content: bytes, before: Iterable[Path] = ()) -> None:
-    """Replace a file in one step: a power loss leaves the old content or the new one.
-
-    The new content is written beside it first. If that fails, the old file stays, and nothing
-    beside it. The files `before` are brought to the disk with it.
-    """
+    """Replace a file in one step, after others are on the disk; a power loss leaves old or new."""
     draft = path.with_name(f".{path.name}.part")
     try:
         draft.write_bytes(content)
         to_disk([draft, *before])
         draft.replace(path)
-    except OSError:
+    except OSError:  # the old file stays, and nothing beside it
         draft.unlink(missing_ok=True)
         raise
     to_disk([path.parent])

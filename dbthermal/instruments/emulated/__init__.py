@@ -5,13 +5,10 @@ for byte where the protocol is public. All say that they are emulated. They were
 descriptions; real devices may do more than these say.
 
 Wheel, shutter, blackbody and thermocouples act on what the cameras see through the `World`; there
-is no physics here. Temperatures are in kelvin, times in seconds on the world's clock; the scene has
-a time of its own, so that a recording can begin with it.
-
-A picture is a function of the scene's time that gives the counts of a band, noise and response
-included. The camera adds a frame rate, a clock, buffers that overflow if no program reads, a
-shutter that freezes the image, and telemetry. It never flags its shutter: as with a real camera,
-that follows from telemetry, serial line and frozen image, see `camera.next_shutter`.
+is no physics here. The scene has a time of its own, so that a recording can begin with it. A
+picture is a function of that time that gives the counts of a band, noise and response included. The
+camera adds a frame rate, a clock, buffers that overflow if no program reads, a shutter that freezes
+the image, and telemetry; as a real one, it never flags its shutter, see `camera.next_shutter`.
 """
 
 import math
@@ -23,6 +20,7 @@ from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
+import xarray as xr
 
 from dbthermal import _text as texts
 from dbthermal import response as responses
@@ -32,6 +30,7 @@ from dbthermal.instruments import camera, telemetry
 from dbthermal.instruments.camera import Counts, Frame
 from dbthermal.instruments.session import Session
 from dbthermal.instruments.transport import Clock, Closing, EmulatedClock
+from dbthermal.response import Curve
 
 Picture = Callable[[float], Counts]
 
@@ -107,10 +106,7 @@ class World:
         return {"room": ROOM, **scene, "blackbody": self.blackbody_temperature}
 
     def thermocouple_temperature(self, channel: int) -> float:
-        """Temperature of the tip of a thermocouple [K]; NaN if it is open or missing.
-
-        KeyError if its place is not in the scene.
-        """
+        """Temperature of the tip of a thermocouple [K]; NaN if open, KeyError if in no scene."""
         place = self.thermocouples.get(channel, "open")
         if place == "open":
             return math.nan
@@ -153,10 +149,8 @@ class World:
 
 
 def emulated_world(session: Session, **settings: Any) -> World:
-    """Bench of an emulated session, at room temperature unless the settings say otherwise.
-
-    The thermocouples are at the places that they are named after.
-    """
+    """Bench of an emulated session, at room temperature unless the settings say otherwise."""
+    # The thermocouples are at the places that they are named after.
     room = dict.fromkeys(session.thermocouples.values(), ROOM)
     world = World(filters=session.filters, **{"scene": lambda _: room, **settings})
     world.furnish(session)
@@ -165,15 +159,12 @@ def emulated_world(session: Session, **settings: Any) -> World:
 
 @dataclass
 class EmulatedCamera(Closing):
-    """A `camera.FrameSource` without a camera; its frames begin with the first `read`.
-
-    It looks through the filter of its `band`, or, where that is None, through the wheel's.
-    """
+    """A `camera.FrameSource` without a camera; its frames begin with the first `read`."""
 
     world: World
     name: str
     pictures: Mapping[str, Picture]  # band to the counts that are seen in it
-    band: str | None = None
+    band: str | None = None  # of its filter; None behind the wheel
     shape: tuple[int, int] = (512, 640)
     frame_rate: float = 60.0  # [Hz]
     telemetry_rows: int = 0
@@ -262,12 +253,7 @@ class EmulatedCamera(Closing):
 
 
 def blackbody_pictures(session: Session, world: World) -> dict[str, Picture]:
-    """Raw frames, by band, of the world's blackbody as the cameras of a session see it.
-
-    Counts follow Planck's law in the band at `World.blackbody_temperature`, with noise of `NETD`,
-    a fixed pattern (see `dbthermal.simulation.pattern`) and 16 bits. Bands that are not in
-    `dbthermal.bands.FILTERS` get no picture.
-    """
+    """Raw frames, by known band, of the world's blackbody as the cameras of a session see it."""
     names = dict.fromkeys((*session.bands, *session.filters.values()))
     bands = tuple(name for name in names if name in FILTERS)
     if not bands:
@@ -275,17 +261,15 @@ def blackbody_pictures(session: Session, world: World) -> dict[str, Picture]:
     # The cameras, with noise and a fixed pattern.
     rig = simulation.Rig(bands=bands, noise=(NETD,) * len(bands))
     detector = simulation.pattern(rig, session.shape, np.random.default_rng(0))
-    response = rig.response()
+    response, pictures = rig.response(), dict[str, Picture]()
 
-    curves = {band: responses.curve(response, band) for band in bands}
-    generators = {band: np.random.default_rng([0, number]) for number, band in enumerate(bands)}
-    patterns = {band: detector.sel(band=band) for band in bands}
-    deviations = {band: float(response["noise"].sel(band=band)) for band in bands}
-
-    def picture(band: str, _: float) -> Counts:
+    def picture(curve: Curve, draw: Callable[[], Any], pattern: xr.Dataset, _: float) -> Counts:
         """Picture of the blackbody in a band, at any time of the scene."""
-        level = float(curves[band].counts(np.array(world.blackbody_temperature)))
-        noise = generators[band].normal(0.0, deviations[band], session.shape)
-        return simulation.digitise(level + noise, patterns[band])
+        level = float(curve.counts(np.array(world.blackbody_temperature)))
+        return simulation.digitise(level + draw(), pattern)
 
-    return {band: partial(picture, band) for band in bands}
+    for number, (band, noise) in enumerate(zip(bands, response["noise"].values, strict=True)):
+        draw = partial(np.random.default_rng([0, number]).normal, 0.0, noise, session.shape)
+        curve, pattern = responses.curve(response, band), detector.sel(band=band)
+        pictures[band] = partial(picture, curve, draw, pattern)
+    return pictures

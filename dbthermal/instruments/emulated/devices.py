@@ -4,11 +4,10 @@ The command port answers every command of `boson` after the public descriptions,
 and runs the shutter on command only. The duration of a correction and the settings at
 power-on, which the descriptions leave open, are choices made here.
 
-The controller answers below the real driver, byte for byte, with the quirks that users report:
-speeds near 0 and a motor without current after power-up, silence if it is addressed wrongly, and
-reports of moves at any time. Its counter of commanded steps agrees with the wheel, an FW103, only
-once the home switch was found. Quirks are from issues 6, 14, 17, 74 and 83 of
-AlexShkarin/pyLabLib and the documentation of thorlabs_apt_device; the rest as in `_apt`.
+The controller answers byte for byte, with the quirks that users report: speeds near 0 and a motor
+without current after power-up, silence if it is addressed wrongly, and reports of moves at any
+time. They are from issues 6, 14, 17, 74 and 83 of AlexShkarin/pyLabLib and the documentation of
+thorlabs_apt_device; the rest as in `_apt`.
 
 The TC-08 has the functions of the vendor's library, by its header ``usbtc08.h``, and none of its
 code. The conversion time is from datalogd's documentation, and likely, not certain.
@@ -47,11 +46,7 @@ _REFUSED: Final = 0x161  # of `boson.STATUSES`: of every request that the driver
 
 
 class Line(Closing):
-    """An emulated device at the end of a line: a `transport.Transport`, for any number of threads.
-
-    A device takes bytes by `receive`, and `poll` gives its replies. Bytes that a driver does not
-    read are kept. `TransportError` once the device is pulled out.
-    """
+    """An emulated device at the end of a line: a `transport.Transport`, for several threads."""
 
     is_simulated, plugged = True, True  # False once it was pulled out
 
@@ -74,7 +69,7 @@ class Line(Closing):
         return 0.0 if self._replies else math.inf
 
     def write(self, data: bytes) -> None:
-        """Give bytes to the device; see `Transport.write`."""
+        """Send all bytes; see `Transport.write`."""
         with self._lock:
             self._check()
             self.receive(data)
@@ -205,17 +200,14 @@ class Drive:
 
 
 class EmulatedApt(Line):
-    """A controller that turns the world's wheel, whose slot 1 is `slot_offset` [deg] from home.
-
-    `position` counts the commanded steps, `wheel` is the place of the wheel from its home switch
-    [count].
-    """
+    """A controller that turns the world's wheel, whose slot 1 is `slot_offset` [deg] from home."""
 
     info = _apt.Info(SERIAL_NUMBER, b"BSC201", notes=b"emulated, not hardware")
     model, unit, address, slot_offset = BSC20X, _apt.RACK, _apt.BAY_1, 0.0
 
     def __init__(self, world: World) -> None:
         super().__init__(world)
+        # The counter of commanded steps, and the place of the wheel from its home switch [count].
         self.position, self.enabled, self.homed = 0, False, False
         slot = 1 if world.wheel_position is None else world.wheel_position
         self.wheel = ((slot - 1) / 6 + self.slot_offset / 360.0) * self.model.turn
@@ -320,15 +312,12 @@ class EmulatedApt(Line):
 
 
 class EmulatedTC08:
-    """The library and one unit, with type-T thermocouples whatever letter they are set to.
-
-    `temperature` returns that of the tip of a channel, 1 to 8 [K], NaN if it is open; a reading is
-    converted on its `clock`. As in the vendor's library, functions return 0 if they fail.
-    """
+    """The library and one unit, with type-T thermocouples whatever letter they are set to."""
 
     is_simulated: Final = True
 
     def __init__(self, temperature: Callable[[int], float], clock: Clock) -> None:
+        # Of the tip of a channel, 1 to 8 [K], NaN if it is open; and where a reading takes time.
         self._temperature, self.clock = temperature, clock
         self.is_open, self.error = False, 0
         self._kinds: dict[int, str] = {}

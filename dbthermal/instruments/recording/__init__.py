@@ -288,10 +288,7 @@ def is_complete(path: str | Path) -> bool:
 
 
 def mean_reading(path: str | Path, source: str) -> float:
-    """Mean of an instrument's readings during a recording, in its unit, without failed ones.
-
-    FileNotFoundError if the recording does not exist; ValueError if it has no such reading.
-    """
+    """Mean of an instrument's readings during a recording, in its unit; ValueError without any."""
     if not (values := [note[3] for note in notes(path) if note[1:3] == ("reading", source)]):
         raise ValueError(f"No reading of '{source}' in the recording '{path}'. Must have one.")
     return float(np.mean(values))
@@ -335,14 +332,12 @@ def _agreed(paths: list[Path], source: str, stability: float) -> float:
 
 
 def _views(paths: list[Path]) -> dict[str, xr.Dataset]:
-    """Counts of each band, of the first recording that has it.
-
-    Of the frames that are whole, have a time, and show the view.
-    """
+    """Counts of each band in the good frames of the first recording that has it."""
     views: dict[str, xr.Dataset] = {}
     for path in paths:
         capture = open_capture(path).assign_attrs(path=str(path))
         for band in map(str, capture["band"].values):
+            # Frames that are whole, have a time, and show the view.
             good = _good(capture.sel(band=band), FrameFlag.SHUTTER_CLOSED, "exposure_time")
             view = capture[["counts"]].sel(band=[band]).isel(time=np.flatnonzero(good))
             views.setdefault(band, view)

@@ -1,10 +1,8 @@
 """The capture file: a recording while it grows, frame by frame and note by note.
 
-Each frame is compared with the frame before: a number that leaps is a loss, a number that does not
-rise a repetition; a stamp that does not rise, or cannot be, is no time; and an image without a
-changed pixel was not taken anew. A damaged frame is written with its flags, and only its exposure
-time is NaN. Losses, shutter events and readings of instruments go into the log. The store explains
-its contents in words, for a reader may have no more than the store.
+Each frame is compared with the frame before, and written with its flags, as `camera.FrameFlag` has
+them; the exposure time of a damaged one is NaN. Losses, shutter events and readings of instruments
+go into the log. The store explains its contents in words, for a reader may have no more than it.
 """
 
 import math
@@ -133,21 +131,18 @@ class _Band:
 
 
 class CaptureFile:
-    """A new recording at `path` that takes frames and notes in the order in which they come.
+    """A new recording that takes frames and notes in the order in which they come.
 
-    `readings` has the unit of each instrument, `chunk` is the number of frames that are written
-    together. FileExistsError if `path` exists; ValueError if the sources differ in shape or
-    telemetry. After a failed write `broken` is True: what was written before is valid, and nothing
-    more may be written.
+    FileExistsError if its path exists; ValueError if the sources differ in shape or telemetry.
     """
 
     def __init__(
         self,
         path: str | Path,
         sources: Mapping[str, FrameSource],
-        readings: Mapping[str, str],
+        readings: Mapping[str, str],  # name to unit
         attrs: Mapping[str, Any],
-        chunk: int,
+        chunk: int,  # frames that are written together
     ) -> None:
         formats = {band: (source.shape, source.telemetry_rows) for band, source in sources.items()}
         if len(set(formats.values())) != 1:
@@ -159,7 +154,7 @@ class CaptureFile:
         self.begin()
         self._names = [*sources, *readings, _RECORDER]
         self._notes: list[tuple[float, ...]] = []  # rows of the log that are not written yet
-        self.broken = False
+        self.broken = False  # True after a failed write: nothing more may be written
         # The store, explained by its attributes.
         attrs = {**attrs, **self._start, "comment": ABOUT, "log_sources": self._names}
         attrs["log_units"] = dict(readings)
@@ -181,11 +176,7 @@ class CaptureFile:
         return self._origin
 
     def frame(self, band: str, frame: Frame, refused: int = 0) -> FrameFlag:
-        """Take a frame, write the chunk if it is full, and return all flags of the frame.
-
-        `refused` is the number of frames of this band that came before it and were not taken. A
-        frame of another shape than the source's is a ValueError.
-        """
+        """Take a frame, after so many that were refused; return all flags of the frame."""
         state, shape = self._bands[band], (self._sizes["y"], self._sizes["x"])
         if frame.counts.shape != shape:
             raise ValueError(f"Invalid frame of {frame.counts.shape} in '{band}'. Must be {shape}.")
@@ -213,6 +204,7 @@ class CaptureFile:
             values["frame_counter"] = decoded.frame_counter
         state.block.append(values)
         state.totals["frames"] += 1
+        # A full chunk is written.
         if len(state.block) == self._chunk:
             self._write(band)
         return flags

@@ -2,9 +2,8 @@
 
 A thread for each camera fetches its frames, a further thread reads the instruments: a camera that
 corrects its offsets answers late, and that costs no frame. A queue of bounded length leads to the
-thread that writes. If the disk is too slow the queue fills, frames are refused, and the log has
-their number and time. The caller's thread shows the preview; whatever ends that, the frames that
-came before are written.
+thread that writes; if the disk is too slow, frames are refused and counted. The caller's thread
+shows the preview; whatever ends that, the frames that came before are written.
 """
 
 import errno
@@ -254,10 +253,7 @@ class _Run:
         self._work.put(partial(self.file.note, kind, source, self.clock(), value))
 
     def _fetch(self, band: str, source: camera.FrameSource) -> None:
-        """Queue the frames of a source for the writer, until the end.
-
-        Without room a frame is refused; the next accepted one carries the number of refused ones.
-        """
+        """Queue the frames of a source for the writer, until the end."""
         refused = 0
         try:
             while self._is_going():
@@ -266,6 +262,7 @@ class _Run:
                 except camera.NoFrameError:
                     self._put_note(Note.NO_FRAME, band, self.limits.silence)
                     continue
+                # Without room it is refused; the next one carries the number of refused frames.
                 if self.clock.has_room(self._room[band]):
                     self._work.put(partial(self._frame, band, frame, refused))
                     refused = 0
@@ -301,10 +298,7 @@ class _Run:
                 preview(Preview(time, frames, self.totals, dict(self.last_readings), self.units))
 
     def write(self) -> None:
-        """Start the other threads, write frames and notes until the end, and close the file.
-
-        Errors go to `errors`. After an error of writing itself the file stays as it is on the disk.
-        """
+        """Start the other threads, write frames and notes until the end, and close the file."""
         self._guarded(self._write)
         self.over.set()
         for thread in self._threads:
@@ -313,6 +307,7 @@ class _Run:
                 late = f"within {self.limits.patience} s after the end. Must keep its time limits."
                 message = f"No answer of the device of '{thread.name}' {late}"
                 self.errors.append(TimeoutError(message))
+        # After an error of writing itself the file stays as it is on the disk.
         if not self.file.broken:
             self._guarded(self._finish)
         self.done.set()
