@@ -1,11 +1,9 @@
 """Every fault of the rig: its error or its mark in a recording, and no frame lost for it.
 
-Instruments are read by their drivers on emulators with a simulated clock; frames come from two
-emulated cameras with counts that tell their time, and every recording is checked against its
-frames (`CheckedRecording`).
+Frames come from two emulated cameras with counts that tell their time, and every recording is
+checked against its frames (`CheckedRecording`).
 """
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -17,16 +15,20 @@ import numpy as np
 import pytest
 import xarray as xr
 from faulty_camera import BANDS, Faults, FaultyCamera, two_bands, two_cameras
-from faulty_devices import BosonBench, LoggerBench, WheelBench
 
 from dbthermal import store
-from dbthermal.instruments.boson import Boson
+from dbthermal.instruments.boson import BosonError, BosonTimeoutError
 from dbthermal.instruments.camera import DAMAGED, UNTIMED, Counts, Frame, FrameFlag
-from dbthermal.instruments.devices import Devices
 from dbthermal.instruments.emulated import World
-from dbthermal.instruments.filterwheel import FilterWheel
+from dbthermal.instruments.filterwheel import (
+    NoReplyError,
+    NotHomedError,
+    StalledWheelError,
+    WheelError,
+)
 from dbthermal.instruments.recording import Limits, Reading, notes, open_capture, record
-from dbthermal.instruments.tc08 import TC08
+from dbthermal.instruments.tc08 import ReadingError, TC08Error
+from dbthermal.instruments.transport import TransportError
 
 SHAPE, RATE, MILLI = (16, 24), 100.0, 1e-3
 LIMITS = Limits(chunk=5, queue=10_000, reserve=0, reading_period=0.02)
@@ -200,83 +202,25 @@ def test_a_clock_that_drifts(tmp_path: Path) -> None:
     np.testing.assert_allclose(fitted[: len(frames)], expected, rtol=0, atol=1e-6)
 
 
-# Instruments: faults of the devices that are read beside the frames.
+# Instruments: errors of the drivers that are read beside the frames.
 
-Instrument = Boson | FilterWheel | TC08
-
-
-def camera(*, plugged: bool = True, mute: bool = False, corrects: bool = False) -> Boson:
-    """A camera that is unplugged or mute, or does not answer while it corrects."""
-    bench = BosonBench()
-    bench.state.plugged, bench.device.stalls = plugged, corrects
-    bench.device.answers = 0 if mute else math.inf
-    if corrects:
-        bench.world.start_ffc("boson")
-    return bench.camera
+TROUBLES: list[Exception] = [
+    *(BosonError("refused"), BosonTimeoutError("mute"), TransportError("unplugged")),
+    *(WheelError("motor hot"), NoReplyError("silent"), NotHomedError("lost")),
+    *(StalledWheelError("stuck"), ReadingError("open"), TC08Error("be read", 16)),
+]
 
 
-def wheel(*, plugged: bool = True, **knobs: object) -> FilterWheel:
-    """A wheel that was sent to the third slot before it got these faults."""
-    bench = WheelBench()
-    bench.homed().move_to(3)
-    bench.device.plugged = plugged
-    vars(bench.device.faults).update(knobs)
-    return bench.wheel
+def test_an_instrument_that_fails_costs_no_frame(tmp_path: Path) -> None:
+    """Slow readings go on beside a failing one; whatever its driver raises is noted as failed."""
+    recorded = CheckedRecording(tmp_path / "a.zarr")
 
-
-def logger(**knobs: object) -> TC08:
-    """A logger of two tips, with these faults."""
-    bench = LoggerBench()
-    bench.ready()
-    vars(bench.unit.faults).update(knobs)
-    return bench.driver
-
-
-TROUBLES: dict[str, tuple[Callable[[], Instrument], float]] = {
-    "Boson: stalled by a correction": (lambda: camera(corrects=True), 308.15),
-    "Boson: mute": (lambda: camera(mute=True), math.nan),
-    "Boson: unplugged": (lambda: camera(plugged=False), math.nan),
-    "wheel: answers lost": (lambda: wheel(drop=1), 3.0),
-    "wheel: an unsolicited error": (lambda: wheel(notice="motor hot"), 3.0),
-    "wheel: silent": (lambda: wheel(silent=True), math.nan),
-    "wheel: unplugged": (lambda: wheel(plugged=False), math.nan),
-    "TC-08: open thermocouple": (lambda: logger(open={1}), math.nan),
-    "TC-08: another one open": (lambda: logger(open={2}), 350.0),
-    "TC-08: overflow": (lambda: logger(overflow={1}), math.nan),
-    "TC-08: unplugged": (lambda: logger(unplugged=True), math.nan),
-}
-"""What is done to which instrument, and what is read of it, NaN if nothing."""
-
-
-def read_beside_frames(device: Instrument) -> Read:
-    """Function with which a recording reads an instrument."""
-    if isinstance(device, FilterWheel):
-        return device.position
-    session = two_bands(1.0, SHAPE, RATE)
-    if isinstance(device, Boson):
-        return Devices(session, {}, {"9.5": device}).readings()["fpa 9.5"].read
-    return Devices(session, {}, thermocouples=device).readings()["plate"].read
-
-
-@pytest.fixture(scope="module")
-def troubled(tmp_path_factory: pytest.TempPathFactory) -> CheckedRecording:
-    """One recording during which every instrument has faults and is slow."""
-    recorded = CheckedRecording(tmp_path_factory.mktemp("troubled") / "a.zarr")
-
-    def slowly(read: Read) -> float:
+    def fail(error: Exception) -> float:
         recorded.world.clock.sleep(0.002)
-        return read()
+        raise error
 
-    readings = {
-        name: partial(slowly, read_beside_frames(make())) for name, (make, _) in TROUBLES.items()
-    }
-    return recorded.record(0.8, readings)
-
-
-@pytest.mark.parametrize("name", TROUBLES)
-def test_what_is_recorded(name: str, troubled: CheckedRecording) -> None:
-    """Valid readings are in the log, all others are noted as failed, and no frame is lost."""
-    value, entries = TROUBLES[name][1], troubled.noted(name)
-    kind = "reading_failed" if math.isnan(value) else "reading"
-    assert troubled.kinds(name) == [kind] * len(entries) != []
-    np.testing.assert_allclose([read for _, read in entries], value, rtol=0, atol=0.05)
+    failing: dict[str, Read] = {type(error).__name__: partial(fail, error) for error in TROUBLES}
+    recorded.record(0.8, {**failing, "plate": lambda: 300.0})
+    for name in failing:
+        assert {*recorded.kinds(name)} == {"reading_failed"}
+    assert {*recorded.noted("plate")} == {("reading", 300.0)}
