@@ -181,20 +181,20 @@ _NOTES: Final = {
 
 def markdown(numbers: Numbers) -> str:
     """Tables of what the separation reaches, in Markdown."""
-    parts = []
+    sections = []
     for title, sources in _SINGLE.items():
         rows = [
             (quantity, _value(numbers, stem, pattern, unit))
             for stem, lines in sources.items()
             for quantity, pattern, unit in lines
         ]
-        parts.append(_part(title, table([("quantity", "value"), *rows])))
+        sections.append(_section(title, table([("quantity", "value"), *rows])))
     for title, (stem, pattern, heads) in _TABLES.items():
-        parts.append(_part(title, table(_pivot(numbers.get(stem, {}), pattern, heads))))
-    return "\n\n".join(parts) + "\n"
+        sections.append(_section(title, table(_pivot(numbers.get(stem, {}), pattern, heads))))
+    return "\n\n".join(sections) + "\n"
 
 
-def _part(title: str, lines: str) -> str:
+def _section(title: str, lines: str) -> str:
     """Heading, sentences and table."""
     return "\n\n".join([f"## {title}", *filter(None, [fill(_NOTES.get(title, ""), 100)]), lines])
 
@@ -212,10 +212,10 @@ def _value(numbers: Numbers, stem: str, pattern: str, unit: str) -> str:
     """Range of the numbers of a notebook whose names, without their unit, fit a pattern."""
     named = re.compile(rf"({pattern})( \[.*\])?")
     values = numbers.get(stem, {}).items()
-    found = [v for k, v in values if named.fullmatch(k) and not isinstance(v, str)]
-    if not found:
+    fitting = [v for k, v in values if named.fullmatch(k) and not isinstance(v, str)]
+    if not fitting:
         return "not measured"
-    ends = dict.fromkeys(_text(end, unit) for end in (min(found), max(found)))
+    ends = dict.fromkeys(_text(end, unit) for end in (min(fitting), max(fitting)))
     return " to ".join(ends) + (f" {unit}" if unit else "")
 
 

@@ -178,8 +178,8 @@ def _separate(path: Path) -> tuple[float, float]:
 
 def peak_memory() -> float:
     """Peak of the memory of this process [byte]."""
-    found = re.search(r"VmHWM:\s+(\d+)", Path("/proc/self/status").read_text())
-    return 1024.0 * float(found[1]) if found else float("nan")
+    line = re.search(r"VmHWM:\s+(\d+)", Path("/proc/self/status").read_text())
+    return 1024.0 * float(line[1]) if line else float("nan")
 
 
 def default_rows(calls: Calls) -> Iterator[tuple[str, ...]]:
@@ -211,8 +211,8 @@ def capture(pixels: int, frames: int, bands: int) -> xr.Dataset:
     row = cases.simulate(glass, rig, np.arange(frames) / RATE, few, seed=1)[1]
     rng, counts = np.random.default_rng(1), row["counts"].values.reshape(bands, frames, few)
     # Frames as a store gives them: an index of NumPy would leave pixels the slowest axis.
-    some = [counts.take(rng.permutation(few), axis=2) for _ in range(pixels // few)]
-    movie = np.stack(some, axis=2)
+    copies = [counts.take(rng.permutation(few), axis=2) for _ in range(pixels // few)]
+    movie = np.stack(copies, axis=2)
     films = {"counts": (("band", "time", "y", "x"), movie, row["counts"].attrs)}
     return xr.Dataset(films, coords={"band": row["band"], "time": row["time"]})
 
@@ -220,9 +220,9 @@ def capture(pixels: int, frames: int, bands: int) -> xr.Dataset:
 def solve(movie: xr.Dataset, method: str) -> xr.Dataset:
     """Separate by one thread."""
     names = [str(band) for band in movie["band"].values]
-    known = xr.DataArray(list(EMISSIVITY[: len(names)]), dims="band", coords={"band": names})
+    emissivities = xr.DataArray(list(EMISSIVITY[: len(names)]), dims="band", coords={"band": names})
     record = outside.get_method(method)
-    emissivity = known if record.knows_emissivity else None
+    emissivity = emissivities if record.knows_emissivity else None
     return separation.solve(movie, response(tuple(names)), record, emissivity=emissivity, workers=1)
 
 
@@ -327,7 +327,7 @@ def methods(times: Times) -> str:
     head = ("method", "µs per pixel", "relative to `subspace`", "pixels", "3, 4 bands")
     lines: list[tuple[str, ...]] = [head]
     of_pixels = {method: times[method, "pixels"] for method in outside.METHODS}
-    cost = {method: found[max(found)] / max(found) for method, found in of_pixels.items()}
+    cost = {method: taken[max(taken)] / max(taken) for method, taken in of_pixels.items()}
     for method, seconds in cost.items():
         bands, size = times[method, "bands"], str(max(of_pixels[method]))
         more = ", ".join(f"{bands[n] / bands[2]:.1f}" for n in sorted(bands) if n > 2) or "none"

@@ -65,10 +65,10 @@ def _result(experiment: Experiment, folder: Path, *args: Any, **options: Any) ->
         _LOGGER.warning("Damaged result '%s'. It is computed again.", path)
     result = experiment(*args, **options)
     folder.mkdir(parents=True, exist_ok=True)
-    with NamedTemporaryFile(dir=folder, prefix=".", delete=False) as part:
+    with NamedTemporaryFile(dir=folder, prefix=".", delete=False) as draft:
         # Not smaller, but with a checksum: compression would take longer than a small experiment.
-        part.write(zlib.compress(pickle.dumps((path.name, result)), level=0))
-    Path(part.name).replace(path)
+        draft.write(zlib.compress(pickle.dumps((path.name, result)), level=0))
+    Path(draft.name).replace(path)
     return result
 
 

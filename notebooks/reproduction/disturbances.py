@@ -63,8 +63,8 @@ def by_cameras(
 ) -> xr.Dataset:
     """Capture, as of `observe`, of a scene for each band of a response: what its camera sees."""
     pairs = enumerate(views)
-    parts = [observe(view, response.isel(band=[band]), rng) for band, view in pairs]
-    return xr.concat(parts, "band", combine_attrs="override")
+    captures = [observe(view, response.isel(band=[band]), rng) for band, view in pairs]
+    return xr.concat(captures, "band", combine_attrs="override")
 
 
 def lose_frames(corrected: xr.Dataset, share: float, rng: np.random.Generator) -> xr.Dataset:

@@ -38,27 +38,27 @@ class Kernel(AsyncKernelManager):
         await super().start_kernel(*arguments, **options)
 
 
-def run_papermill(stem: str, part: Path, values: Mapping[str, Any]) -> None:
+def run_papermill(stem: str, draft: Path, values: Mapping[str, Any]) -> None:
     """Execute a notebook; raises what papermill raises, RuntimeError if a cell did not run."""
     papermill.execute_notebook(
         paths.notebook(stem),
-        part,
+        draft,
         parameters=values,
         kernel_name="python3",
         kernel_manager_class=Kernel,
         progress_bar=False,
         cwd=paths.root() / "notebooks",
     )
-    for number, cell in enumerate(nbformat.read(part, nbformat.NO_CONVERT).cells):
+    for number, cell in enumerate(nbformat.read(draft, nbformat.NO_CONVERT).cells):
         if cell.cell_type == "code" and cell.source.strip() and cell.execution_count is None:
-            raise RuntimeError(f"Unfinished notebook '{part}': cell {number} did not run.")
+            raise RuntimeError(f"Unfinished notebook '{draft}': cell {number} did not run.")
 
 
-def run_nbval(stem: str, part: Path, values: Mapping[str, Any]) -> None:
+def run_nbval(stem: str, draft: Path, values: Mapping[str, Any]) -> None:
     """Run a notebook as a test, as it is stored; RuntimeError with a failing cell's report."""
     if values:
         raise ValueError(f"Invalid parameters {[*values]} of '{stem}'. Must be none in a check.")
-    shutil.copyfile(paths.notebook(stem), part)
+    shutil.copyfile(paths.notebook(stem), draft)
     # The other plugins, of which a notebook needs none, take twice as long to load as this one.
     command = ["pytest", "--quiet", "--no-header", "-p", "nbval.plugin", "-p", "no:cacheprovider"]
     report = subprocess.run(
@@ -85,38 +85,40 @@ def execute(
     It is as old as its start, so that whatever changed while it ran is newer. Raises what the
     runner raises for a cell that fails.
     """
-    part, start = paths.unfinished(run, stem), time.time()
-    path = part.with_name(f"{stem}.ipynb")
+    draft, start = paths.unfinished(run, stem), time.time()
+    path = draft.with_name(f"{stem}.ipynb")
     failed = paths.root() / "results" / "failed" / run / path.name
-    part.parent.mkdir(parents=True, exist_ok=True)
+    draft.parent.mkdir(parents=True, exist_ok=True)
     if path.exists():  # from here on no name says that it is whole
-        path.replace(part)
-    part.touch()
-    store.to_disk([part, part.parent])
+        path.replace(draft)
+    draft.touch()
+    store.to_disk([draft, draft.parent])
     failed.unlink(missing_ok=True)
-    _remove(part, stem)
+    _remove(draft, stem)
     try:
-        runner(stem, part, values)
+        runner(stem, draft, values)
     except BaseException:
-        _remove(part, stem)
+        _remove(draft, stem)
         failed.parent.mkdir(parents=True, exist_ok=True)
-        part.replace(failed)
+        draft.replace(failed)
         raise
     integrity.keep_sums(run, stem)
-    os.utime(part, (start, start))
+    os.utime(draft, (start, start))
     sums = paths.sums(run, stem)
-    store.to_disk([part, sums, *part.parent.glob(f"{stem}*"), *part.parent.glob(f"{stem}*/**/*")])
-    part.replace(path)
+    store.to_disk(
+        [draft, sums, *draft.parent.glob(f"{stem}*"), *draft.parent.glob(f"{stem}*/**/*")]
+    )
+    draft.replace(path)
     store.to_disk([path.parent])
     return path
 
 
-def _remove(part: Path, stem: str) -> None:
+def _remove(draft: Path, stem: str) -> None:
     """Remove what a notebook wrote, but not the unfinished notebook itself."""
-    for result in [*part.parent.glob(f"{stem}*"), *part.parent.glob(f".{stem}*")]:
+    for result in [*draft.parent.glob(f"{stem}*"), *draft.parent.glob(f".{stem}*")]:
         if result.is_dir() and not result.is_symlink():
             shutil.rmtree(result)
-        elif result != part:
+        elif result != draft:
             result.unlink()
 
 

@@ -20,7 +20,7 @@ class DamagedError(RuntimeError):
 
 def keep_sums(run: str, stem: str) -> None:
     """Keep the checksums of all files that a notebook wrote, but of the notebook itself."""
-    tops = [one for one in paths.results(run).glob(f"{stem}*") if one.name != f"{stem}.ipynb"]
+    tops = [path for path in paths.results(run).glob(f"{stem}*") if path.name != f"{stem}.ipynb"]
     files = [file for top in tops for file in ([top] if top.is_file() else top.rglob("*"))]
     names = {
         str(file.relative_to(paths.results(run))): store.checksum(file)
@@ -45,9 +45,9 @@ def maker(path: Path) -> tuple[str, str] | None:
     if not path.absolute().is_relative_to(results):
         return None
     run, *names = path.absolute().relative_to(results).parts
-    stems = [one.stem for one in (paths.root() / "notebooks").glob("[0-9][0-9]_*.ipynb")]
-    found = [stem for stem in stems if names and names[0].startswith(stem)]
-    return (run, max(found)) if found else None
+    stems = [file.stem for file in (paths.root() / "notebooks").glob("[0-9][0-9]_*.ipynb")]
+    makers = [stem for stem in stems if names and names[0].startswith(stem)]
+    return (run, max(makers)) if makers else None
 
 
 @contextmanager

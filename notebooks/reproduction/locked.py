@@ -112,10 +112,10 @@ def mirror() -> Path | None:
 def descendants(of: int) -> list[int]:
     """Process numbers of all that a process started, and of what that started, but of the dead."""
     parents = {number: parent for number, parent, dead in _processes() if not dead}
-    found = {of}
-    while more := {number for number, parent in parents.items() if parent in found} - found:
-        found |= more
-    return sorted(found - {of})
+    family = {of}
+    while more := {number for number, parent in parents.items() if parent in family} - family:
+        family |= more
+    return sorted(family - {of})
 
 
 def _processes() -> Iterable[tuple[int, int, bool]]:
@@ -138,15 +138,15 @@ def end_descendants() -> None:
     """End all that this process started: by SIGTERM, and after `_GRACE` by SIGKILL."""
     start = time.monotonic()
     asked, foreign = set[int](), set[int]()  # foreign: of another user
-    while left := {*descendants(os.getpid())} - foreign:
+    while living := {*descendants(os.getpid())} - foreign:
         killed = time.monotonic() > start + _GRACE
-        for number in left if killed else left - asked:
+        for number in living if killed else living - asked:
             with suppress(ProcessLookupError):
                 try:
                     os.kill(number, signal.SIGKILL if killed else signal.SIGTERM)
                 except PermissionError:
                     foreign.add(number)
-        asked.update(left)
+        asked.update(living)
         time.sleep(0.02)
 
 
@@ -167,8 +167,8 @@ def _caught(process: int) -> int:
     bits = 1 << signal.SIGINT - 1 | 1 << signal.SIGHUP - 1
     with suppress(OSError):
         text = Path(f"/proc/{process}/status").read_text()
-        if found := re.search(r"^SigCgt:\s*([0-9a-f]+)$", text, re.MULTILINE):
-            return int(found[1], 16) & bits
+        if line := re.search(r"^SigCgt:\s*([0-9a-f]+)$", text, re.MULTILINE):
+            return int(line[1], 16) & bits
     return 0
 
 
@@ -191,8 +191,8 @@ def main(make: str, outer: int) -> int:
     command = [make, "--no-print-directory", *goals]
 
     def end(number: int, _: FrameType | None) -> None:
-        for other in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            signal.signal(other, signal.SIG_IGN)
+        for caught in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(caught, signal.SIG_IGN)
         end_descendants()
         os._exit(128 + number)
 

@@ -196,8 +196,8 @@ def _download(file: File) -> Callable[[str, str, object], None]:
             Path(path).open("wb") as output,
         ):
             response.raise_for_status()
-            while part := response.raw.read1(2**16, decode_content=False):
-                size += output.write(part)
+            while block := response.raw.read1(2**16, decode_content=False):
+                size += output.write(block)
                 if size > file.bytes:
                     rule = f"Must be the listed {file.bytes} bytes"
                     raise OSError(f"Invalid size of '{url}'. {rule}.")

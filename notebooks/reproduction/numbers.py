@@ -38,8 +38,8 @@ def save(
         "provenance": dict(provenance),
     }
     content["sha256"] = _digest(content)
-    with store.whole(path, ".json") as part:
-        part.write_text(as_json(content, indent=2) + "\n", encoding="utf-8")
+    with store.whole(path, ".json") as draft:
+        draft.write_text(as_json(content, indent=2) + "\n", encoding="utf-8")
 
 
 def read(path: str | Path) -> dict[str, Number]:

@@ -49,9 +49,9 @@ def _decode(path: Path, width: int | None, memory: float, sha256: str | None) ->
     content = texts.regular_file(path, int(memory)).read_bytes()
     kinds = _CONTAINERS.items()
     form = next((name for name, (at, marks) in kinds if content[at : at + 4] in marks), None)
-    found = hashlib.sha256(content).hexdigest()
-    if sha256 is not None and found != sha256:
-        raise ValueError(f"Wrong SHA-256 {found} of '{path.name}'. Must be {sha256}.")
+    digest = hashlib.sha256(content).hexdigest()
+    if sha256 is not None and digest != sha256:
+        raise ValueError(f"Wrong SHA-256 {digest} of '{path.name}'. Must be {sha256}.")
     if form is None:
         raise ValueError(f"Invalid video '{path.name}'. Must be MP4, MOV, Matroska, WebM or AVI.")
     # The largest frame that may be decoded, and checks where a codec has checksums.
@@ -350,20 +350,20 @@ def _project(points: Array, corners: Array, place: Array, distance: Array) -> No
     for p in range(len(points)):
         x, y, z = points[p, 0], points[p, 1], points[p, 2]
         for i in range(len(corners)):
-            one, two, three = x - corners[i, 0], y - corners[i, 1], z - corners[i, 2]
-            squares[i] = one * one + two * two + three * three
+            red, green, blue = x - corners[i, 0], y - corners[i, 1], z - corners[i, 2]
+            squares[i] = red * red + green * green + blue * blue
         best, within = np.inf, (np.sqrt(squares.min()) + longest) ** 2
         for i in range(len(steps)):
             if min(squares[i], squares[i + 1]) > within:
                 continue
-            along, left = 0.0, 0.0
+            along, remainder = 0.0, 0.0
             for k in range(3):
                 along += (points[p, k] - corners[i, k]) * steps[i, k]
             share = min(max(along / max(lengths[i], 1e-300), 0.0), 1.0)
             for k in range(3):
-                left += (points[p, k] - corners[i, k] - share * steps[i, k]) ** 2
-            if left < best:
-                best, place[p] = left, i + share
+                remainder += (points[p, k] - corners[i, k] - share * steps[i, k]) ** 2
+            if remainder < best:
+                best, place[p] = remainder, i + share
         distance[p] = np.sqrt(best)
 
 

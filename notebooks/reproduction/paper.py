@@ -129,10 +129,10 @@ def compare(numbers: Numbers) -> Iterator[tuple[str, ...]]:
             for label, value in values.items()
         ]
         paper = "-" if row.published is None else f"{row.published:g}{_after(row.unit)}"
-        here = ", ".join(texts) or "-"
+        ours = ", ".join(texts) or "-"
         if row.reference is not None:
-            paper, here = (f"{text} (reference {row.reference:g})" for text in (paper, here))
-        yield (row.place, row.quantity, paper, here, row.data, row.verdict(numbers))
+            paper, ours = (f"{text} (reference {row.reference:g})" for text in (paper, ours))
+        yield (row.place, row.quantity, paper, ours, row.data, row.verdict(numbers))
 
 
 def markdown(numbers: Numbers) -> str:

@@ -73,12 +73,12 @@ def check(values: Mapping[str, Any], small: Mapping[str, Any], source: str) -> N
         if name not in small:
             message = f"Unknown parameter '{name}' in {source}"
             raise ValueError(f"{message}. Must be one of {sorted(small)}.")
-        place, known = f"parameter '{name}' in {source}", small[name]
-        _check_kind(place, value, known, whole=type(known) is int)
-        if type(known) is int and known >= 0 > value:
+        place, default = f"parameter '{name}' in {source}", small[name]
+        _check_kind(place, value, default, whole=type(default) is int)
+        if type(default) is int and default >= 0 > value:
             raise ValueError(f"Invalid parameter '{name}' = {value} in {source}. Must be >= 0.")
-        if isinstance(value, dict) and len(_kinds(known)) > 1 and value.keys() != known.keys():
-            rule = f"Must have the names {[*known]}."
+        if isinstance(value, dict) and len(_kinds(default)) > 1 and value.keys() != default.keys():
+            rule = f"Must have the names {[*default]}."
             raise ValueError(f"Invalid names {[*value]} of {place}. {rule}")
 
 
@@ -95,26 +95,26 @@ def _assigned(cell: str) -> dict[str, Any]:
     return values
 
 
-def _check_kind(place: str, value: Any, known: Any, *, whole: bool = False) -> None:
+def _check_kind(place: str, value: Any, default: Any, *, whole: bool = False) -> None:
     """Raise a ValueError if a value is of another kind than the known one, or not finite within."""
     if isinstance(value, float) and not math.isfinite(value):
         raise ValueError(f"Invalid {place}: {value}. Must be finite.")
-    kind = _kind(known, whole=whole)
-    if known is not None and _kind(value, whole=whole) != kind:
-        raise ValueError(f"Invalid {place}: {value!r}. Must be {kind}, as {known!r} is.")
+    kind = _kind(default, whole=whole)
+    if default is not None and _kind(value, whole=whole) != kind:
+        raise ValueError(f"Invalid {place}: {value!r}. Must be {kind}, as {default!r} is.")
     if isinstance(value, dict):
-        for name, part in value.items():
-            _check_kind(f"'{name}' of {place}", part, (known or {}).get(name))
+        for name, entry in value.items():
+            _check_kind(f"'{name}' of {place}", entry, (default or {}).get(name))
     elif isinstance(value, list):
-        one = known[0] if known and len(_kinds(known)) == 1 else None
-        for number, part in enumerate(value):
-            _check_kind(f"entry {number} of {place}", part, one)
+        example = default[0] if default and len(_kinds(default)) == 1 else None
+        for number, entry in enumerate(value):
+            _check_kind(f"entry {number} of {place}", entry, example)
 
 
-def _kinds(known: Any) -> set[str]:
+def _kinds(default: Any) -> set[str]:
     """Kinds within a list or a mapping."""
-    parts = known.values() if isinstance(known, dict) else known or ()
-    return {_kind(part) for part in parts}
+    entries = default.values() if isinstance(default, dict) else default or ()
+    return {_kind(entry) for entry in entries}
 
 
 def _kind(value: Any, *, whole: bool = False) -> str:

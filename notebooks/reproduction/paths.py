@@ -90,10 +90,10 @@ def unfinished(run: str, stem: str) -> Path:
 
 def finished(run: str, stem: str) -> str:
     """Stem of a notebook whose results are whole; RuntimeError if it runs, or was interrupted."""
-    if (part := unfinished(run, stem)).exists():
+    if (draft := unfinished(run, stem)).exists():
         raise RuntimeError(
             f"Unfinished notebook '{stem}' of run '{run}': it is running, or was interrupted. Must "
-            f"have run to its end: 'make results/{run}/{stem}.ipynb', or remove '{part}' and what "
+            f"have run to its end: 'make results/{run}/{stem}.ipynb', or remove '{draft}' and what "
             "it left."
         )
     return stem

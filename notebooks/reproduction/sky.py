@@ -77,8 +77,8 @@ def spectra(path: Path, names: Sequence[str]) -> xr.DataArray:
         time = file["time"][:].astype(np.float64)
     temperatures = []
     for band in map(dbt.bands.get, names):
-        inside = (wavenumber > 1e-2 / band.upper) & (wavenumber < 1e-2 / band.lower)
-        within = np.trapezoid(radiance[:, inside], wavenumber[inside], axis=1)
+        in_band = (wavenumber > 1e-2 / band.upper) & (wavenumber < 1e-2 / band.lower)
+        within = np.trapezoid(radiance[:, in_band], wavenumber[in_band], axis=1)
         temperatures.append(band.temperature(within))
     coords = {"band": [*names], "time": time}
     attrs = {"units": "K", "origin": "measured"}

@@ -161,10 +161,10 @@ def uncalibrated_reflection(signal: xr.DataArray) -> xr.Dataset:
             "order": _ORDER,
         },
     )
-    for name, part in (("ratio", ratio), ("correlation", correlation)):
-        result[name] = ("y", "x"), part.reshape(image), {"units": "1"}
-    for name, part in (("reflection", reflection), ("emission", values[0] - reflection)):
-        result[name] = ("time", "y", "x"), part.reshape(frames, *image).astype(np.float32), units
+    for name, film in (("ratio", ratio), ("correlation", correlation)):
+        result[name] = ("y", "x"), film.reshape(image), {"units": "1"}
+    for name, film in (("reflection", reflection), ("emission", values[0] - reflection)):
+        result[name] = ("time", "y", "x"), film.reshape(frames, *image).astype(np.float32), units
     return result
 
 
@@ -238,15 +238,15 @@ def edges_shift(movie: xr.DataArray) -> xr.DataArray:
     Median of those of five parts of the capture, from `alignment.register` of their mean pictures.
     Parts without edges, as before anything is warm, are left out; NaN if all are.
     """
-    parts: list[Array] = []
+    shifts: list[Array] = []
     for frames in np.array_split(np.arange(movie.sizes["time"]), _PARTS):
         # Register the part as if its values were counts.
         counts = movie.isel(time=frames).drop_vars("gain", errors="ignore").rename("counts")
         capture = counts.astype("float32").assign_attrs(units="count").to_dataset()
         with contextlib.suppress(ValueError):
-            found = alignment.register(capture, model="translation").isel(band=1)
-            parts.append(-found.values[[1, 0], 2])
-    return _displacement(np.median(parts or [np.full(2, np.nan)], axis=0))
+            transform = alignment.register(capture, model="translation").isel(band=1)
+            shifts.append(-transform.values[[1, 0], 2])
+    return _displacement(np.median(shifts or [np.full(2, np.nan)], axis=0))
 
 
 def reflections_shift(movie: xr.DataArray, outline: xr.DataArray) -> xr.DataArray:
@@ -269,8 +269,8 @@ def reflections_shift(movie: xr.DataArray, outline: xr.DataArray) -> xr.DataArra
         return _displacement(np.full(2, np.nan)).assign_attrs(attrs)
     peak = (place - REACH).astype(np.float64)
     for axis, step in enumerate(np.eye(2, dtype=int)):
-        below, here, above = (scores[tuple(place + k * step)] for k in (-1, 0, 1))
-        peak[axis] += 0.5 * (below - above) / (below - 2 * here + above)
+        below, middle, above = (scores[tuple(place + k * step)] for k in (-1, 0, 1))
+        peak[axis] += 0.5 * (below - above) / (below - 2 * middle + above)
     return _displacement(peak).assign_attrs(attrs)
 
 
@@ -282,25 +282,25 @@ def _rapid(signal: xr.DataArray, weight: Array, values: Array) -> Array:
     """Weighted changes (band, time, pixel) of a signal's values that smooth functions leave."""
     functions, _ = np.linalg.qr(weight * smooth.polynomial_basis(signal["time"].values, _ORDER))
     rapid = weight * values
-    return np.asarray(rapid - [functions @ (functions.T @ part) for part in rapid])
+    return np.asarray(rapid - [functions @ (functions.T @ band) for band in rapid])
 
 
-def _correlations(first: Movie, second: Movie, inside: Mask) -> Array:
+def _correlations(first: Movie, second: Movie, outline: Mask) -> Array:
     """Correlation of second(p) with first(p + d) over the object, by d within `REACH`."""
-    size = [next_fast_len(n + r, real=True) for n, r in zip(inside.shape, REACH, strict=True)]
+    size = [next_fast_len(n + r, real=True) for n, r in zip(outline.shape, REACH, strict=True)]
 
-    def lagged(there: npt.NDArray[np.floating], here: npt.NDArray[np.floating]) -> Array:
-        """Sum over p of there(p + d) here(p)."""
-        both = np.conj(np.fft.rfft2(here, size)) * np.fft.rfft2(there, size)
+    def lagged(ahead: npt.NDArray[np.floating], behind: npt.NDArray[np.floating]) -> Array:
+        """Sum over p of ahead(p + d) behind(p)."""
+        spectrum = np.conj(np.fft.rfft2(behind, size)) * np.fft.rfft2(ahead, size)
         rows, columns = (np.arange(-reach, reach + 1) for reach in REACH)
-        return np.asarray(np.fft.irfft2(both, size)[np.ix_(rows, columns)])
+        return np.asarray(np.fft.irfft2(spectrum, size)[np.ix_(rows, columns)])
 
     cross = sum(lagged(a, b) for a, b in zip(first, second, strict=True))
-    mask = inside.astype(np.float64)
+    mask = outline.astype(np.float64)
     shared = lagged(mask, mask)
     energy = lagged(np.sum(first**2, axis=0), mask) * lagged(mask, np.sum(second**2, axis=0))
-    found = (shared >= _SHARED * mask.sum()) & (energy > 0)
-    return np.where(found, cross / np.sqrt(np.where(found, energy, 1.0)), -1.0)
+    defined = (shared >= _SHARED * mask.sum()) & (energy > 0)
+    return np.where(defined, cross / np.sqrt(np.where(defined, energy, 1.0)), -1.0)
 
 
 def moved(movie: xr.DataArray, displacement: xr.DataArray) -> xr.DataArray:
@@ -319,5 +319,5 @@ def moved(movie: xr.DataArray, displacement: xr.DataArray) -> xr.DataArray:
 def shared_outline(outline: xr.DataArray, displacement: xr.DataArray) -> xr.DataArray:
     """Pixels (y, x) that show the object in both bands, the first displaced if that is known."""
     back = -np.nan_to_num(displacement.values)
-    there = shift(outline.values.astype(float), back, order=1)
-    return outline.copy(data=outline.values & (there > 0.99))
+    displaced = shift(outline.values.astype(float), back, order=1)
+    return outline.copy(data=outline.values & (displaced > 0.99))

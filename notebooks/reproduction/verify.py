@@ -76,8 +76,8 @@ def agree(value: object, expected: object) -> bool:
 
 def enclosed(page: str, marks: tuple[str, str], text: str, name: str) -> str:
     """Page with a text between two marks; `name` is the page's in an error."""
-    head, start, rest = page.partition(marks[0])
-    _, stop, tail = rest.partition(marks[1])
+    head, start, after_start = page.partition(marks[0])
+    _, stop, tail = after_start.partition(marks[1])
     if not (start and stop):
         raise ValueError(f"Missing marks {marks} in {name}. Must enclose its table.")
     return f"{head}{start}\n\n{text}\n{stop}{tail}"

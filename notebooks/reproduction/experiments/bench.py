@@ -54,11 +54,11 @@ def band_emissivity(sample: Sample, names: tuple[str, ...]) -> xr.DataArray:
     result stays between 0 and 1.
     """
     kin = embedded_table()["emissivity"].sel(material=sample.kin, drop=True)
-    own = kin.sel(band=list(names))
+    values = kin.sel(band=list(names))
     if sample.emissivity < 0.5:
-        value = sample.emissivity * own / float(kin.sel(band=_CAMERA_BAND))
+        value = sample.emissivity * values / float(kin.sel(band=_CAMERA_BAND))
     else:
-        ratio = (1.0 - own) / (1.0 - float(kin.sel(band=_CAMERA_BAND)))
+        ratio = (1.0 - values) / (1.0 - float(kin.sel(band=_CAMERA_BAND)))
         value = 1.0 - (1.0 - sample.emissivity) * ratio
     return value.assign_attrs(units="1")
 
@@ -126,8 +126,8 @@ def bench_series(
     [0.1, 0.1]
     """
     warm, cold = (
-        part.ravel()
-        for part in np.meshgrid(bench.object_temperatures, bench.blackbody_temperatures)
+        grid.ravel()
+        for grid in np.meshgrid(bench.object_temperatures, bench.blackbody_temperatures)
     )
     stray = rng.uniform(0.0, sample.stray)
     room = _blackbody(response, np.full_like(cold, bench.air_temperature))

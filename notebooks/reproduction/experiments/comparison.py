@@ -64,16 +64,16 @@ def compare(
     chosen = _choose(scene, pixels, rng)
     truth = _strip(scene, chosen)
     frames = scene.isel(time=slice(None, None, EVERY))
-    imaging = [methods.get_method(one["method"]).whole_image for one in variants.values()]
+    imaging = [methods.get_method(variant["method"]).whole_image for variant in variants.values()]
     strip = simulation.observe(truth, response, rng)
     images = simulation.observe(frames, response, rng) if any(imaging) else strip
     rows = []
     for options, whole in zip(variants.values(), imaging, strict=True):
         truth_seen, seen = (frames, images) if whole else (truth, strip)
-        known = arguments(options)
-        if known["method"].knows_emissivity:
-            known["emissivity"] = truth_seen["emissivity"]
-        result = separation.solve(seen, response, seed=seed, **known)
+        stated = arguments(options)
+        if stated["method"].knows_emissivity:
+            stated["emissivity"] = truth_seen["emissivity"]
+        result = separation.solve(seen, response, seed=seed, **stated)
         rows.append(judge(truth, _strip(result, chosen) if whole else result))
     label = xr.DataArray(list(variants), dims="variant", name="variant")
     together = xr.concat(rows, dim=label, coords="minimal", compat="override")
@@ -108,20 +108,20 @@ def medians(comparison: xr.Dataset, default: str = "subspace") -> xr.Dataset:
     temperature.
     """
     over = [dim for dim in ("pixel", "seed") if dim in comparison.dims]
-    known = comparison["object_temperature_rmse"].notnull()
-    counted = known.sel(variant=default)
-    parts = {}
+    solved = comparison["object_temperature_rmse"].notnull()
+    counted = solved.sel(variant=default)
+    variables = {}
     for name in ("object_temperature_rmse", "emissivity_error"):
         worst = comparison[name].fillna(np.inf).where(counted)
         median = worst.median(over)
-        parts[name] = median.where(np.isfinite(median)).assign_attrs(comparison[name].attrs)
+        variables[name] = median.where(np.isfinite(median)).assign_attrs(comparison[name].attrs)
     off = ~(comparison["emissivity_error"].max("band", skipna=False) <= WRONG)
     shares = {
         "wrong": off.where(counted).mean(over),
-        "solved": known.mean(over),
+        "solved": solved.mean(over),
     }
-    parts |= {name: part.assign_attrs(units="1") for name, part in shares.items()}
-    return xr.Dataset(parts, attrs=comparison.attrs)
+    variables |= {name: share.assign_attrs(units="1") for name, share in shares.items()}
+    return xr.Dataset(variables, attrs=comparison.attrs)
 
 
 def _choose(scene: xr.Dataset, pixels: int, rng: np.random.Generator) -> np.ndarray:
@@ -153,8 +153,8 @@ def arguments(variant: Options) -> dict[str, Any]:
     method = methods.get_method(variant["method"])
     kind = method.settings
     names = set() if kind is None else {field.name for field in fields(kind)} & variant.keys()
-    rest = {name: value for name, value in variant.items() if name not in names}
-    rest["method"] = method
+    further = {name: value for name, value in variant.items() if name not in names}
+    further["method"] = method
     if kind is not None and names:
-        rest["settings"] = kind(**{name: variant[name] for name in names})
-    return rest
+        further["settings"] = kind(**{name: variant[name] for name in names})
+    return further

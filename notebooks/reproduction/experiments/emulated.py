@@ -94,11 +94,11 @@ def _bench(
     """Counts of samples before a blackbody, at the temperatures that the world has now."""
 
     def look(_: float) -> Array:
-        here = world.scene_temperatures()
-        reflected = curve.counts(np.array(here["blackbody"]))
+        temperatures = world.scene_temperatures()
+        reflected = curve.counts(np.array(temperatures["blackbody"]))
         counts = np.full(shape, float(reflected))
         for name, place in places.items():
-            emitted = curve.counts(np.array(here[name]))
+            emitted = curve.counts(np.array(temperatures[name]))
             counts[place] = mixing.leaving(emissivity[name], emitted, reflected)
         return counts
 

@@ -75,7 +75,7 @@ def rates(
     shares = {name: counts[name] / counts["pixels"].where(counts["pixels"] > 0) for name in _SHARES}
     shares["false_alarms"] = counts["alarms"] / counts["clean_pixels"]
     judged = counts[["pixels", "clean_pixels"]].assign(shares)
-    judged = judged.map(lambda one: one.assign_attrs(units="1"))
+    judged = judged.map(lambda rate: rate.assign_attrs(units="1"))
     return judged.assign_attrs(origin="simulated", seed=seed, far=FAR)
 
 
@@ -139,14 +139,14 @@ def _pictured(
         spoiled = np.asarray((capture["spoiled"] > 0).any("band"))
         return drawn, separation.solve(correction.mark_bad(capture), response), spoiled
     if shift is None:
-        alone = separation.solve(capture, response)
-        labels = xr.zeros_like(alone["status"], dtype=int)
-        known = flag == Status.COMPLETED_FROM_MATERIAL.label
-        parts = (labels, None, None) if known else (None, None, pair)
-        whole = separation.complete(alone, capture, response, *parts)
-        missing = alone["object_temperature"].isnull()
-        some = flag == Status.COMPLETED_FRAMES.label
-        holds = missing.any("time") & ~missing.all("time") if some else missing.all("time")
+        per_pixel = separation.solve(capture, response)
+        labels = xr.zeros_like(per_pixel["status"], dtype=int)
+        by_material = flag == Status.COMPLETED_FROM_MATERIAL.label
+        labelled = (labels, None, None) if by_material else (None, None, pair)
+        whole = separation.complete(per_pixel, capture, response, *labelled)
+        missing = per_pixel["object_temperature"].isnull()
+        by_frames = flag == Status.COMPLETED_FRAMES.label
+        holds = missing.any("time") & ~missing.all("time") if by_frames else missing.all("time")
         return drawn, whole, holds.values
     if flag == Status.BANDS_APART.label:
         moving = drawn["background_temperature"].std("time").max("band") > _MOVING
@@ -168,7 +168,7 @@ def _unpaired(shift: Array) -> Mask:
     grid = np.indices(_SHAPE, dtype=np.float64)
     place = grid.copy()
     for _ in range(_ITERATIONS):
-        place = grid - [map_coordinates(one, place, order=1, mode="nearest") for one in shift]
+        place = grid - [map_coordinates(move, place, order=1, mode="nearest") for move in shift]
     size = np.reshape(_SHAPE, (2, 1, 1))
     return np.asarray(((place < -0.5) | (place > size - 0.5)).any(axis=0))
 
@@ -202,8 +202,8 @@ def _frozen(counts: Film, pixels: Mask, rng: np.random.Generator) -> None:
     """Runs of frames in which all bands repeat the frame before."""
     frames = counts.shape[1]
     for start in rng.choice(frames // _RUN, int(_FROZEN * frames / _RUN), replace=False) * _RUN:
-        part = counts[:, start : start + _RUN]
-        part[...] = np.where(pixels, part[:, :1], part)
+        run = counts[:, start : start + _RUN]
+        run[...] = np.where(pixels, run[:, :1], run)
 
 
 FAULTS: Final[Mapping[str, Change]] = {

@@ -55,14 +55,14 @@ def plate(
     return Search(tile, replace(SETTINGS, **settings)), truth
 
 
-def losses(films: Any, rest: Any, search: Search) -> Any:
+def losses(films: Any, scalars: Any, search: Search) -> Any:
     """Weighted losses (5, pixel) [1] of films (pixel, 3, time) [K] and rest (pixel, 3), as tensors.
 
     The deviation that normalises the Huber loss counts as a constant.
     """
     sigma = torch.tensor(search.tile.noise, dtype=torch.float64)[:, None]
     limit, floor = SETTINGS.huber_threshold * sigma, SETTINGS.deviation_floor * sigma
-    offset, first, second = rest[..., None].unbind(1)
+    offset, first, second = scalars[..., None].unbind(1)
     rise = torch.cumsum(second / first * torch.diff(films[:, 0]), -1)  # the smooth signals' ratio
     smooth = torch.stack([films[:, 0], torch.cat([offset, offset + rise], -1)], 1)
     noise, corrected = films[:, 1:], torch.tensor(search.signals) - films[:, 1:]
@@ -71,29 +71,29 @@ def losses(films: Any, rest: Any, search: Search) -> Any:
     huber = torch.nn.functional.huber_loss(residual / limit, 0 * residual, reduction="none")
     error = residual[:, 1] - (1 - second) / (1 - first) * residual[:, 0]
     bend = torch.diff(smooth, n=2) / (SETTINGS.curvature * INTERVAL**2)
-    parts = {
+    terms = {
         "smoothness": (bend**2).sum((1, 2)) / films.shape[-1],
         "huber": (limit / scale * huber).mean(-1).sum(-1),
         "reconstruction": ((error / sigma[1]) ** 2).mean(-1),
         "noise": ((noise / sigma) ** 2).mean(-1).sum(-1),
         "noise_mean": ((noise / sigma).mean(-1) ** 2).sum(-1),
     }
-    return torch.stack([getattr(SETTINGS, name) * part for name, part in parts.items()])
+    return torch.stack([getattr(SETTINGS, name) * term for name, term in terms.items()])
 
 
 def newton_gradient(search: Search, column: int) -> tuple[Array, ...]:
     """Losses, and the gradient of a Newton step: by smooth signal, noise, offset, emissivities."""
-    films, rest, signals = search.films[column], search.scalars[column], search.signals[column]
+    films, scalars, signals = search.films[column], search.scalars[column], search.signals[column]
     weights, sigma = search.weights, search.tile.noise
     deviation = [
         objective.deviation(*band, SETTINGS.deviation_floor)
         for band in zip(signals, films[1:], sigma, strict=True)
     ]
     scale = objective.Scale(sigma, tuple(deviation), 1.0)
-    _, forces, blocks = objective.system(films, rest, signals, scale, weights, 1.0)
+    _, forces, blocks = objective.system(films, scalars, signals, scale, weights, 1.0)
     # The forces are those of the eliminated noise: q N^-1 pull is put back.
-    noise = objective.noise_step(blocks, 0.0 * films, rest, scale, weights)[1:]
-    (_, e1, e2), variance = rest, np.square(sigma)[:, None]
+    noise = objective.noise_step(blocks, 0.0 * films, scalars, scale, weights)[1:]
+    (_, e1, e2), variance = scalars, np.square(sigma)[:, None]
     k1, k2 = e2 / e1, (1 - e2) / (1 - e1)
     # g_n1, g_n2 = q n + mean - (h p)_m +- w r; beyond the noise's term they are those of I1~, I2~.
     of_noise = forces[:, :2].T - (weights.noise + weights.noise_mean) / variance * noise
@@ -109,9 +109,9 @@ def newton_gradient(search: Search, column: int) -> tuple[Array, ...]:
     by_k2 = -blocks[:, 4] @ error
     # dk1 = (de2 - k1 de1) / e1, dk2 = (k2 de1 - de2) / (1 - e1)
     by_emissivity = [by_k2 * k2 / (1 - e1) - by_k1 * k1 / e1, by_k1 / e1 - by_k2 / (1 - e1)]
-    parts = smooth, blocks[:, :2].T, second.sum(), np.array(by_emissivity)
-    values = objective.losses(films, rest, signals, scale, weights)
-    return values, *(2 / films.shape[1] * part for part in parts)
+    gradients = smooth, blocks[:, :2].T, second.sum(), np.array(by_emissivity)
+    values = objective.losses(films, scalars, signals, scale, weights)
+    return values, *(2 / films.shape[1] * gradient for gradient in gradients)
 
 
 def disagreements(search: Search, rng: np.random.Generator) -> xr.DataArray:
@@ -121,11 +121,11 @@ def disagreements(search: Search, rng: np.random.Generator) -> xr.DataArray:
     """
     search = copy.deepcopy(search)
     search.films += rng.standard_normal(search.films.shape) * np.array([[1.0], [0.1], [0.1]])
-    films, rest = (
-        torch.tensor(part, requires_grad=True) for part in (search.films, search.scalars)
+    films, scalars = (
+        torch.tensor(data, requires_grad=True) for data in (search.films, search.scalars)
     )
-    total = losses(films, rest, search)
-    gradient = (part.numpy() for part in torch.autograd.grad(total.sum(), (films, rest)))
+    total = losses(films, scalars, search)
+    gradient = (data.numpy() for data in torch.autograd.grad(total.sum(), (films, scalars)))
     rows = []
     for column, (film, border) in enumerate(zip(*gradient, strict=True)):
         values = total[:, column].detach().numpy(), film[0], film[1:], border[0], border[1:]
@@ -150,16 +150,18 @@ def newton(start: Search, truth: xr.DataArray) -> tuple[Search, xr.Dataset]:
 
 def adam(start: Search, truth: xr.DataArray, rate: float, looks: Sequence[int]) -> xr.Dataset:
     """What is `judged` at some steps of Adam of a rate [K, and 1 of emissivities]."""
-    films, rest = (torch.tensor(part, requires_grad=True) for part in (start.films, start.scalars))
-    descent, began, points = torch.optim.Adam([films, rest], lr=rate), time.process_time(), []
+    films, scalars = (
+        torch.tensor(data, requires_grad=True) for data in (start.films, start.scalars)
+    )
+    descent, began, points = torch.optim.Adam([films, scalars], lr=rate), time.process_time(), []
     for number in range(1, max(looks) + 1):
         descent.zero_grad()
-        losses(films, rest, start).sum().backward()
+        losses(films, scalars, start).sum().backward()
         descent.step()
         with torch.no_grad():
-            rest[:, 1:].clamp_(SETTINGS.margin, 1 - SETTINGS.margin)
+            scalars[:, 1:].clamp_(SETTINGS.margin, 1 - SETTINGS.margin)
         if number in looks:
-            at = films.detach().clone(), rest.detach().clone()
+            at = films.detach().clone(), scalars.detach().clone()
             points.append((number, time.process_time() - began, *at))
     return judged(start, truth, points)
 
@@ -171,15 +173,15 @@ def judged(search: Search, truth: xr.DataArray, points: Sequence[tuple[Any, ...]
     `object_temperature_rmse` [K], `emissivity_error` of the worse band [1].
     """
     rows, signals = [], np.moveaxis(search.tile.signals, -1, 0)
-    for number, seconds, films, rest in points:
-        reached = losses(films, rest, search).sum(0).numpy()
-        corrected, emissivity = signals - films[:, 1:].numpy(), rest[:, 1:].numpy()
+    for number, seconds, films, scalars in points:
+        reached = losses(films, scalars, search).sum(0).numpy()
+        corrected, emissivity = signals - films[:, 1:].numpy(), scalars[:, 1:].numpy()
         ratio = np.divide(*(1 - emissivity.T[::-1]))[:, None]
         warm = (corrected[:, 1] - ratio * corrected[:, 0]) / (1 - ratio)
         rmse = np.sqrt(np.mean((warm - truth.values) ** 2, axis=1))
         off = np.abs(emissivity - truth.attrs["emissivity"]).max(axis=1)
         medians = (np.median(values) for values in (reached, rmse, off))
-        rows.append([number, 1e3 * seconds / len(rest), *medians])
+        rows.append([number, 1e3 * seconds / len(scalars), *medians])
     names = ["iteration", "time", "objective", "object_temperature_rmse", "emissivity_error"]
     coords = {"look": np.arange(len(rows)), "quantity": names}
     table = xr.DataArray(np.array(rows), coords, ("look", "quantity"))

@@ -54,8 +54,8 @@ class Picture:
         moved = mirror(rows + shift[0], columns + shift[1])
         views = [cold] + [moved] * (emissivity.sizes["band"] - 1)
         background = scene["background_temperature"]
-        both = (("band", *background.dims), np.stack(views), background.attrs)
-        scene["background_temperature"] = both
+        variable = (("band", *background.dims), np.stack(views), background.attrs)
+        scene["background_temperature"] = variable
         units = {"units": "pixel", "long_name": "where the first band shows the reflection"}
         scene["shift"] = (("axis", "y", "x"), shift, units)
         return scene.assign_coords(axis=["y", "x"])
@@ -108,9 +108,9 @@ class Picture:
                 radius = np.hypot(u, v) + 1e-9
                 slope = np.hypot(u / half, v / tall) / radius
                 outside = (radius - 1.0) / slope
-                inside = 1.0 / (1.0 + np.exp(np.clip(outside / self.sharpness, -50.0, 50.0)))
+                share = 1.0 / (1.0 + np.exp(np.clip(outside / self.sharpness, -50.0, 50.0)))
                 warmth = warmer * (1.0 + 0.3 * np.sin(3.0 * u + 1.0) * np.cos(4.0 * v))
-                result[seen] += (warmth + ROOM - result[seen]) * inside
+                result[seen] += (warmth + ROOM - result[seen]) * share
             if edge:
                 result = ROOM + (result - ROOM) / (1.0 + np.exp((edge - columns) / 0.7))
             return result

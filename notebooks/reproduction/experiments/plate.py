@@ -122,8 +122,8 @@ def readings(
     # Each film at the pixel and at the nearest of its frames.
     place = {"y": pixel[0], "x": pixel[1]}
     curves = {name: film.isel(place) for name, film in films.items() if film is not None}
-    shown = {name: part.sel(time=times, method="nearest") for name, part in curves.items()}
-    columns = {name: part.values.astype(np.float64) - zero_Celsius for name, part in shown.items()}
+    shown = {name: line.sel(time=times, method="nearest") for name, line in curves.items()}
+    columns = {name: line.values.astype(np.float64) - zero_Celsius for name, line in shown.items()}
     return pd.DataFrame(columns, pd.Index(times, name="time [s]")).round(2)
 
 
@@ -142,7 +142,7 @@ def known_emissivity(scene: Plate) -> xr.Dataset | None:
 
 
 def scores(
-    scene: Plate, alone: xr.Dataset, whole: xr.Dataset, known: xr.Dataset | None
+    scene: Plate, per_pixel: xr.Dataset, whole: xr.Dataset, calibrated: xr.Dataset | None
 ) -> dict[str, float]:
     """Headline numbers: shares of pixels, and errors and intervals against the truth, if known.
 
@@ -150,7 +150,7 @@ def scores(
     and of the whole scene, in all that have samples.
     """
     # Shares of pixels without a flag, and of usable samples that have a value.
-    good, name = alone["status"] == 0, "object_temperature"
+    good, name = per_pixel["status"] == 0, "object_temperature"
     usable = ~schema.has_flag(whole["status"], "dead_pixel", "invalid_samples")
     value = whole[name].where(usable)
     sampled = scene.corrected["counts"].notnull().all("band") & usable  # that both cameras have
@@ -158,12 +158,14 @@ def scores(
         "good_pixels": good.mean(),
         "whole_finite": value.where(sampled).notnull().sum() / sampled.sum(),
     }
-    if scene.truth is None or known is None:
+    if scene.truth is None or calibrated is None:
         return {name: float(share) for name, share in shares.items()}
     # Errors of the object, and intervals by the noise alone.
-    noise, noise_of_whole = (separation.without_calibration(part) for part in (alone, whole))
-    error = (alone[name] - scene.truth[name]).where(good)
-    of_known = (known[name] - scene.truth[name]).where(good)
+    noise, noise_of_whole = (
+        separation.without_calibration(result) for result in (per_pixel, whole)
+    )
+    error = (per_pixel[name] - scene.truth[name]).where(good)
+    of_known = (calibrated[name] - scene.truth[name]).where(good)
     of_whole = value - scene.truth[name]
     values = shares | {
         "twin_rmse_subspace_K": rmse(error),
@@ -174,7 +176,7 @@ def scores(
         "twin_coverage_95_whole": held(of_whole, noise_of_whole[f"{name}_std"], _WIDTH),
     }
     # Errors of the emissivities, band by band.
-    off = abs(alone["emissivity"] - scene.truth["emissivity"]).where(good)
+    off = abs(per_pixel["emissivity"] - scene.truth["emissivity"]).where(good)
     within = (off <= noise["emissivity_std"]).where(good).mean(("y", "x"))
     for band in off["band"].values:
         values[f"twin_emissivity_error_{band}"] = off.sel(band=band).median()
@@ -205,8 +207,8 @@ def trial(emissivity: float, noise: float) -> Figure:
     figure.axes[0].plot(time, reading - zero_Celsius, color="0.6", linewidth=0.6, zorder=0)
     first = result.isel(y=0, x=0)
     flags = [bit.label for bit in schema.Status if int(first["status"]) & bit]
-    found = f"{float(first['emissivity'][0]):.3f} +- {float(first['emissivity_std'][0]):.3f}"
-    text = f"emissivity {emissivity:.2f}, estimated {found}; flags: {', '.join(flags) or 'none'}"
+    measured = f"{float(first['emissivity'][0]):.3f} +- {float(first['emissivity_std'][0]):.3f}"
+    text = f"emissivity {emissivity:.2f}, estimated {measured}; flags: {', '.join(flags) or 'none'}"
     figure.axes[0].set_title(text, fontsize=8)
     return figure
 

@@ -47,7 +47,7 @@ def compare_procedures(
     }
     dims, unit = ("object", "procedure", "band"), {"units": "1"}
     return xr.Dataset(
-        {"true": true, **{name: (dims, part, unit) for name, part in statistics.items()}},
+        {"true": true, **{name: (dims, statistic, unit) for name, statistic in statistics.items()}},
         coords={"procedure": list(PROCEDURES)},
         attrs={"origin": "simulated twin", "repeats": repeats},
     )
@@ -109,6 +109,6 @@ def _measured(
     """Emissivity and its deviation by every procedure, (2, procedure, band)."""
     bias, stds = bench.bias(sample), (bench.reading_std, bench.blackbody_std)
     series = bench_series(response, sample, bench, rng)
-    fits = [calibration.fit_emissivity(series, response, stds, *known) for known in ((bias,), ())]
+    fits = [calibration.fit_emissivity(series, response, stds, *biases) for biases in ((bias,), ())]
     estimates = [(fit["emissivity"].values, fit["emissivity_std"].values) for fit in fits]
     return np.stack([*estimates, _by_reflector(response, sample, bench, rng)], axis=1)

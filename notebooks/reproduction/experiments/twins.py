@@ -61,16 +61,16 @@ def judge_twin(
     rng, response = np.random.default_rng(seed), simulation.Rig().response()
     scene = twins.twin(name, capture, rng)
     fit = on_bench(response, material, rng)
-    known = {"emissivity": fit["emissivity"], "emissivity_std": fit["emissivity_std"]}
+    stated = {"emissivity": fit["emissivity"], "emissivity_std": fit["emissivity_std"]}
     informed = {
-        label: {**options, **(known if options["method"] == "calibrated" else {})}
+        label: {**options, **(stated if options["method"] == "calibrated" else {})}
         for label, options in variants.items()
     }
     views = {"one place": simulation.observe(scene, response, rng)}
     if capture.baseline:
         apart = twins.observe(scene, response, rng)
         views = {how: twins.registered(scene, apart, how) for how in registrations} | views
-    parts, picture = [], None
+    scores, picture = [], None
     for cameras, corrected in views.items():
         shift = alignment.reflection_shift(corrected, response) if cameras != "one place" else None
         separated = separation.solve(corrected, response, reflection_shift=shift)
@@ -90,10 +90,10 @@ def judge_twin(
         # Share of the pixels with a moving background whose object rests.
         moving, still = _moving(scene), scene["object_temperature"].std("time") < RESTING
         resting = ((moving & still).sum() / moving.sum()).assign_attrs(units="1")
-        both = {**image.data_vars, "resting": resting, "emissivity_difference": away}
-        parts.append(read.assign_coords(way=image["way"]).assign(both))
+        maps = {**image.data_vars, "resting": resting, "emissivity_difference": away}
+        scores.append(read.assign_coords(way=image["way"]).assign(maps))
     label = xr.DataArray(list(views), dims="cameras", name="cameras")
-    return xr.concat(parts, label, join="outer", combine_attrs="override"), picture
+    return xr.concat(scores, label, join="outer", combine_attrs="override"), picture
 
 
 def capture_of(
@@ -130,8 +130,8 @@ def _with_truth(
     """Result with the inputs and the truth beside it, see `separate_twin`."""
     seen = responses.apparent_temperature(response, corrected["counts"])
     films = {
-        f"true_{part}_temperature": scene[f"{part}_temperature"]
-        for part in ("object", "background")
+        f"true_{layer}_temperature": scene[f"{layer}_temperature"]
+        for layer in ("object", "background")
     }
     films["apparent_temperature"] = seen.assign_attrs(scene.attrs)
     films = {name: film.astype("float32") for name, film in films.items()}
@@ -247,19 +247,19 @@ def _mean(
     seen = corrected
     if variant["method"] in PIXELWISE:
         reach = REACH if "reflection_shift" in options else 0
-        around = {
-            dim: slice(max(0, part.start - reach), part.stop + reach)
-            for dim, part in square.items()
+        window = {
+            dim: slice(max(0, places.start - reach), places.stop + reach)
+            for dim, places in square.items()
         }
-        seen = corrected.isel(around)
+        seen = corrected.isel(window)
         if reach:
-            nearby = options["reflection_shift"] = options["reflection_shift"].isel(around)
+            nearby = options["reflection_shift"] = options["reflection_shift"].isel(window)
             if not bool(nearby["shift"].notnull().any()):
                 return (corrected["time"].astype(np.float64) * np.nan).assign_attrs(units="K")
     if methods.get_method(variant["method"]).whole_image:
         seen = seen.isel(time=slice(None, None, EVERY))
     estimates = separation.solve(seen, response, **options)["object_temperature"]
-    bead = {dim: corrected[dim][part] for dim, part in square.items()}
+    bead = {dim: corrected[dim][places] for dim, places in square.items()}
     return estimates.sel(bead).mean(("y", "x"), skipna=False)
 
 
@@ -271,7 +271,7 @@ def share(estimate: xr.DataArray, cause: xr.DataArray) -> float:
     with a the first (time, y, x) and b its cause, each less its mean over time, over all samples in
     which the first is known, in one unit. Raises a ValueError if the cause does not change there.
     """
-    a, b = (part - part.where(estimate.notnull()).mean("time") for part in (estimate, cause))
+    a, b = (film - film.where(estimate.notnull()).mean("time") for film in (estimate, cause))
     power = float((b**2).where(estimate.notnull()).sum())
     if not power > 0:
         raise ValueError("Invalid cause without change where anything was estimated. Must change.")

@@ -70,16 +70,16 @@ def record(  # noqa: PLR0913 - all that is done to the scene, by name
         scene, response, rng, every=_STEPS, offsets=(0, late), frames=count
     ).drop_vars("exposure_time")
     # The first view begins at the first whole pixel that the second has, too.
-    top, left = max(-down, 0), max(-right, 0)
+    top, first_column = max(-down, 0), max(-right, 0)
 
-    def part(wide: xr.Dataset, y: int, x: int) -> xr.Dataset:
+    def cropped(wide: xr.Dataset, y: int, x: int) -> xr.Dataset:
         inner = wide.isel(y=slice(y, y + shape[0]), x=slice(x, x + shape[1]))
         return inner.assign_coords(y=np.arange(shape[0]), x=np.arange(shape[1]))
 
     first, second = (seen.isel(band=[band]) for band in (0, 1))
-    views = part(first, top, left), part(second, top + down, left + right)
+    views = cropped(first, top, first_column), cropped(second, top + down, first_column + right)
     seen = xr.concat(views, "band", combine_attrs="override")
-    truth = part(scene.isel(time=slice(0, _STEPS * count, _STEPS)), top, left)
+    truth = cropped(scene.isel(time=slice(0, _STEPS * count, _STEPS)), top, first_column)
     seen = disturbances.spoil_pixels(seen, lost[1], rng).drop_vars("spoiled")
     last = float(seen["time"][-1])
     seen = disturbances.fire_shutter(seen, last * np.array(shutter), rng)

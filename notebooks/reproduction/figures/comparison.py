@@ -143,19 +143,19 @@ def emissivity_procedures(
     `true` (object, band), `mean` and `spread` (object, procedure, band) [1], drawn for one band
     with lines of one standard deviation; published: label -> object -> the paper's value [1].
     """
-    here = compared.sel(band=band)
-    objects, procedures = here["object"].values, here["procedure"].values
+    in_band = compared.sel(band=band)
+    objects, procedures = in_band["object"].values, in_band["procedure"].values
     figure, ((axis,),) = canvas(1, 1, (8.5, 3.8))
     place = np.arange(objects.size)
-    axis.bar(place, here["true"], 0.85, color="0.88", label="truth")
+    axis.bar(place, in_band["true"], 0.85, color="0.88", label="truth")
     marks = len(procedures) + len(published)
     shifts = iter(0.14 * (np.arange(marks) - (marks - 1) / 2))
     for index, name in enumerate(procedures):
-        part = here.sel(procedure=name)
+        by_procedure = in_band.sel(procedure=name)
         axis.errorbar(
             place + next(shifts),
-            part["mean"],
-            part["spread"],
+            by_procedure["mean"],
+            by_procedure["spread"],
             fmt="o",
             markersize=4,
             color=COLORS[index],
@@ -221,15 +221,15 @@ def error_over_bound(measured: xr.Dataset) -> Figure:
     ):
         once = "case" not in cases[f"{name}_error"].dims
         for index, case in enumerate(cases["case"].values):
-            here, mark = cases.sel(case=case), drawing.marked_line(index)
-            error, bound = here[f"{name}_error"], here[f"{name}_bound"]
+            of_case, mark = cases.sel(case=case), drawing.marked_line(index)
+            error, bound = of_case[f"{name}_error"], of_case[f"{name}_bound"]
             label = f"{case}, " if str(case) else ""
             line = {"color": mark["color"], "linewidth": 1, "label": f"{label}bound"}
-            above.plot(here["noise"], bound, **line)
-            below.plot(here["noise"], error / bound, **mark)
+            above.plot(of_case["noise"], bound, **line)
+            below.plot(of_case["noise"], error / bound, **mark)
             if not once:
                 above.plot(
-                    here["noise"], error, label=f"{label}measured", **mark | {"linewidth": 0}
+                    of_case["noise"], error, label=f"{label}measured", **mark | {"linewidth": 0}
                 )
         if once:
             above.plot(cases["noise"], cases[f"{name}_error"], "ko", markersize=4, label="measured")
@@ -252,19 +252,21 @@ def pooling(measured: xr.Dataset) -> Figure:
     Over `size`, pixels in a group: `reflection_ratio_error`, its bound `reflection_ratio_bound` and
     the separation's own deviation `stated` [1]; `object_temperature_error` [K].
     """
-    figure, ((left, right),) = canvas(1, 2, (9.0, 3.6))
+    figure, ((first, second),) = canvas(1, 2, (9.0, 3.6))
     size = measured["size"]
-    left.plot(size, measured["reflection_ratio_bound"], color="black", linewidth=0.8, label="bound")
-    left.plot(size, measured["stated"], color=COLORS[3], linewidth=1.2, label="stated")
-    left.plot(size, measured["reflection_ratio_error"], "o", color=COLORS[0], label="measured")
-    right.plot(size, measured["object_temperature_error"], "o-", color=COLORS[1], linewidth=1)
-    left.set(ylabel="error of the reflection ratio [1]")
-    right.set(ylabel="error of the object temperature [K]")
-    for axis in (left, right):
+    first.plot(
+        size, measured["reflection_ratio_bound"], color="black", linewidth=0.8, label="bound"
+    )
+    first.plot(size, measured["stated"], color=COLORS[3], linewidth=1.2, label="stated")
+    first.plot(size, measured["reflection_ratio_error"], "o", color=COLORS[0], label="measured")
+    second.plot(size, measured["object_temperature_error"], "o-", color=COLORS[1], linewidth=1)
+    first.set(ylabel="error of the reflection ratio [1]")
+    second.set(ylabel="error of the object temperature [K]")
+    for axis in (first, second):
         axis.set(xscale="log", yscale="log", xlabel="pixels of one material [1]")
         drawing.plain_ticks(axis, size)
         drawing.plain_decades(axis)
-    left.legend(frameon=False, fontsize=8)
+    first.legend(frameon=False, fontsize=8)
     figure.suptitle("Pixels that share a material" + drawing.provenance_note(measured))
     return figure
 
@@ -275,23 +277,23 @@ def error_over_bands(measured: xr.Dataset) -> Figure:
     Over `bands`, names of the bands in use: `object_temperature_error` [K] and, over `case` too,
     `object_temperature_bound` [K].
     """
-    figure, ((left, right),) = canvas(1, 2, (9.0, 3.8))
+    figure, ((first, second),) = canvas(1, 2, (9.0, 3.8))
     error, place = measured["object_temperature_error"], np.arange(measured.sizes["bands"])
     for index, case in enumerate(measured["case"].values):
         bound = measured["object_temperature_bound"].sel(case=case)
-        left.plot(place, bound, color=COLORS[index], linewidth=1, label=f"{case}, bound")
-        right.plot(place, error / bound, **drawing.marked_line(index))
-    left.plot(place, error, "ko", markersize=5, label="measured")
-    left.set(ylabel="error of the object temperature [K]")
-    left.set_ylim(bottom=0)
-    right.set(ylabel="error / bound [1]")
-    right.axhline(1.0, color="black", linewidth=0.6)
-    for axis in (left, right):
+        first.plot(place, bound, color=COLORS[index], linewidth=1, label=f"{case}, bound")
+        second.plot(place, error / bound, **drawing.marked_line(index))
+    first.plot(place, error, "ko", markersize=5, label="measured")
+    first.set(ylabel="error of the object temperature [K]")
+    first.set_ylim(bottom=0)
+    second.set(ylabel="error / bound [1]")
+    second.axhline(1.0, color="black", linewidth=0.6)
+    for axis in (first, second):
         axis.set(xlabel=f"bands [{_MICRO}]")
         names = [str(name).replace(" + ", "\n") for name in measured["bands"].values]
         axis.set_xticks(place, names, fontsize=8)
         axis.grid(visible=True, color="0.9")
-    left.legend(frameon=False, fontsize=8)
+    first.legend(frameon=False, fontsize=8)
     figure.suptitle("More bands" + drawing.provenance_note(measured))
     return figure
 
@@ -305,19 +307,19 @@ def pooled_materials(
     Labels (y, x) of -1 are of no material; the borders of the true panels (y, x) are drawn as
     lines.
     """
-    figure, ((left, middle, right),) = canvas(1, 3, (12.0, 3.4))
+    figure, ((first, second, third),) = canvas(1, 3, (12.0, 3.4))
     limits = limits_of(single)
-    for axis, ratio, title in ((left, single, "pixel by pixel"), (middle, pooled, "pooled")):
+    for axis, ratio, title in ((first, single, "pixel by pixel"), (second, pooled, "pooled")):
         label = "reflection ratio [1]"
         draw_image(figure, axis, ratio, title, label, cmap="viridis", limits=limits)
     labelled = labels.where(labels >= 0)
     title = f"materials found: {np.unique(labelled.values[labelled.notnull().values]).size}"
-    right.imshow(labelled % 10, cmap="tab10", vmin=0, vmax=9, interpolation="nearest")
-    right.set_facecolor("0.8")
-    right.set_title(title, fontsize=9)
-    for axis in (left, middle, right):
-        for one in np.unique(panels.values)[1:]:
-            axis.contour(panels.values >= one, levels=[0.5], colors="white", linewidths=0.8)
+    third.imshow(labelled % 10, cmap="tab10", vmin=0, vmax=9, interpolation="nearest")
+    third.set_facecolor("0.8")
+    third.set_title(title, fontsize=9)
+    for axis in (first, second, third):
+        for material in np.unique(panels.values)[1:]:
+            axis.contour(panels.values >= material, levels=[0.5], colors="white", linewidths=0.8)
         axis.set(xticks=[], yticks=[])
     figure.suptitle("Pixels of one material share their ratio" + drawing.provenance_note(single))
     return figure

@@ -33,20 +33,20 @@ def accuracy(sweep: xr.Dataset) -> Figure:
     """
     figure, axes = canvas(1, 2, (11.0, 0.34 * sweep.sizes["case"] + 1.8))
     place = np.arange(sweep.sizes["case"])
-    left, right = axes[0]
-    left.barh(place, sweep["object_temperature_rmse"], color=COLORS[0])
+    first, second = axes[0]
+    first.barh(place, sweep["object_temperature_rmse"], color=COLORS[0])
     bands = sweep["band"].values
     for index, band in enumerate(bands):
         shifted = place + 0.36 * (index - (len(bands) - 1) / 2)
         values = sweep["emissivity_error"].sel(band=band)
-        right.barh(shifted, values, 0.34, color=COLORS[index], label=band_label(band))
-    for axis in (left, right):
+        second.barh(shifted, values, 0.34, color=COLORS[index], label=band_label(band))
+    for axis in (first, second):
         axis.set_yticks(place, sweep["case"].values, fontsize=8)
         axis.invert_yaxis()
-    right.legend(frameon=False, fontsize=8)
-    left.set_xlabel("median RMSE of the object temperature [K]")
-    right.set_xlabel("median error of the emissivity [1]")
-    right.set_yticklabels([])
+    second.legend(frameon=False, fontsize=8)
+    first.set_xlabel("median RMSE of the object temperature [K]")
+    second.set_xlabel("median error of the emissivity [1]")
+    second.set_yticklabels([])
     figure.suptitle("Accuracy of the separation" + provenance_note(sweep))
     return figure
 
@@ -81,22 +81,22 @@ def validity(stress: xr.Dataset) -> Figure:
     among, band) [1].
     """
     figure, axes = canvas(1, 2, (12.5, 5.0))
-    left, right = axes[0]
-    left.get_gridspec().set_width_ratios([1.4, 1.0])
-    _bars(left, stress["status"], stress["bad"].sel(kind="any"))
+    first, second = axes[0]
+    first.get_gridspec().set_width_ratios([1.4, 1.0])
+    _bars(first, stress["status"], stress["bad"].sel(kind="any"))
     coverage = {"object temperature, no flag": stress["object_coverage"].sel(among="unflagged")}
     for band in stress["band"].values:
         among_all = stress["emissivity_coverage"].sel(among="all", band=band)
         coverage[f"emissivity, {band_label(band)}, all with a value"] = among_all
-    _dots(right, coverage)
+    _dots(second, coverage)
     place = np.arange(stress.sizes["case"])
-    left.set_yticks(place, stress["case"].values, fontsize=8)
-    right.set_yticks(place, [""] * place.size)
-    for axis in (left, right):
+    first.set_yticks(place, stress["case"].values, fontsize=8)
+    second.set_yticks(place, [""] * place.size)
+    for axis in (first, second):
         axis.set_ylim(place.size - 0.4, -0.6)
         axis.spines[["top", "right"]].set_visible(False)
     style: dict[str, Any] = {"frameon": False, "fontsize": 8}
-    words, dots = (axis.get_legend_handles_labels() for axis in (left, right))
+    words, dots = (axis.get_legend_handles_labels() for axis in (first, second))
     figure.legend(*words, loc="outside lower left", ncols=2, **style)
     rows = max(-(-len(words[1]) // 2), len(dots[1]))
     figure.set_figheight(0.29 * place.size + 0.18 * rows + 1.7)
@@ -108,16 +108,16 @@ def validity(stress: xr.Dataset) -> Figure:
 def _bars(axis: Axes, flags: xr.DataArray, bad: xr.DataArray) -> None:
     """Stacked bars (case): right, wrong, and each flag; the wrong ones as a number, too."""
     first, wrong = first_reason(flags.transpose("case", "pixel")), bad.transpose("case", "pixel")
-    parts = {
+    colors = {
         "no flag and right": (_RIGHT, (first == "") & ~wrong.values),
         "no flag and wrong (error above 4 standard deviations)": (
             _WRONG,
             (first == "") & wrong.values,
         ),
     }
-    parts |= {words: (color, first == name) for name, (words, color) in REASONS.items()}
+    colors |= {words: (color, first == name) for name, (words, color) in REASONS.items()}
     place, reached = np.arange(flags.sizes["case"]), np.zeros(flags.sizes["case"])
-    for label, (color, mask) in parts.items():
+    for label, (color, mask) in colors.items():
         share = 100 * mask.mean(axis=1)
         if share.any() or color in {_RIGHT, _WRONG}:
             axis.barh(place, share, 0.8, left=reached, color=color, label=label)
@@ -161,16 +161,16 @@ def offsets(measured: xr.Dataset) -> Figure:
     Over `delay`, the true offset [frame]: `found` [frame]; and over `treatment` too,
     `object_temperature_rmse` [K] and `flagged` [1].
     """
-    figure, ((left, middle, right),) = canvas(1, 3, (12.0, 3.6))
-    left.axhline(0.0, color="black", linewidth=0.6)
-    left.plot(measured["delay"], measured["found"] - measured["delay"], "o", color=COLORS[0])
-    left.set(ylabel="error of the offset [frame]", ylim=(-0.1, 0.1))
-    _lines(middle, measured[_RMSE], "delay")
-    _lines(right, 100 * measured["flagged"], "delay")
-    _kelvin(middle)
-    right.set(ylabel="flagged [%]", ylim=(-3, 103))
-    _over((left, middle, right), "offset of the second band [frame]")
-    middle.legend(frameon=False, fontsize=8)
+    figure, ((first, second, third),) = canvas(1, 3, (12.0, 3.6))
+    first.axhline(0.0, color="black", linewidth=0.6)
+    first.plot(measured["delay"], measured["found"] - measured["delay"], "o", color=COLORS[0])
+    first.set(ylabel="error of the offset [frame]", ylim=(-0.1, 0.1))
+    _lines(second, measured[_RMSE], "delay")
+    _lines(third, 100 * measured["flagged"], "delay")
+    _kelvin(second)
+    third.set(ylabel="flagged [%]", ylim=(-3, 103))
+    _over((first, second, third), "offset of the second band [frame]")
+    second.legend(frameon=False, fontsize=8)
     figure.suptitle("Bands exposed apart" + provenance_note(measured))
     return figure
 
@@ -184,10 +184,10 @@ def disturbances(measured: xr.Dataset) -> Figure:
     names, treatments = measured["nuisance"].values, measured["treatment"].values
     width = 0.8 / treatments.size
     for index, treatment in enumerate(treatments):
-        here = measured.sel(treatment=treatment)
+        rows = measured.sel(treatment=treatment)
         place = np.arange(names.size) + width * (index - (treatments.size - 1) / 2)
-        axis.bar(place, here[_RMSE], width, color=COLORS[index % len(COLORS)], label=treatment)
-        for at, value, share in zip(place, here[_RMSE].values, here["flagged"].values, strict=True):
+        axis.bar(place, rows[_RMSE], width, color=COLORS[index % len(COLORS)], label=treatment)
+        for at, value, share in zip(place, rows[_RMSE].values, rows["flagged"].values, strict=True):
             text = f"{value:.2f} K\n{100 * share:.0f} % flagged"
             axis.text(at, value, text, ha="center", va="bottom", fontsize=7)
     axis.set_xticks(np.arange(names.size), names)
@@ -204,16 +204,16 @@ def parallax(measured: xr.Dataset) -> Figure:
     Over `parallax` [pixel] and `treatment`: `object_temperature_rmse` [K], `flagged` and `covered`
     [1].
     """
-    figure, ((left, middle, right),) = canvas(1, 3, (12.0, 3.6))
-    _lines(left, measured[_RMSE], "parallax")
-    _lines(middle, 100 * measured["flagged"], "parallax")
-    _lines(right, 100 * measured["covered"], "parallax")
-    _kelvin(left)
-    middle.set(ylabel="flagged [%]", ylim=(-3, 103))
-    right.axhspan(92, 98, color=COLORS[2], alpha=0.3, linewidth=0)
-    right.set(ylabel="95 % intervals that hold, no flag [%]", ylim=(-3, 103))
-    _over((left, middle, right), "parallax of the reflection [pixel]")
-    left.legend(frameon=False, fontsize=8)
+    figure, ((first, second, third),) = canvas(1, 3, (12.0, 3.6))
+    _lines(first, measured[_RMSE], "parallax")
+    _lines(second, 100 * measured["flagged"], "parallax")
+    _lines(third, 100 * measured["covered"], "parallax")
+    _kelvin(first)
+    second.set(ylabel="flagged [%]", ylim=(-3, 103))
+    third.axhspan(92, 98, color=COLORS[2], alpha=0.3, linewidth=0)
+    third.set(ylabel="95 % intervals that hold, no flag [%]", ylim=(-3, 103))
+    _over((first, second, third), "parallax of the reflection [pixel]")
+    first.legend(frameon=False, fontsize=8)
     figure.suptitle("Two cameras side by side" + provenance_note(measured))
     return figure
 

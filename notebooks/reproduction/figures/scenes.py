@@ -65,12 +65,12 @@ def compared_pictures(
 
     The first film's attributes say what the data are.
     """
-    known = {} if truth is None else {"true": truth}
+    reference = {} if truth is None else {"true": truth}
     shown = {
         name: values.sel(time=list(times), method="nearest") - zero_Celsius
-        for name, values in {**films, **known}.items()
+        for name, values in {**films, **reference}.items()
     }
-    off = {f"{name} less true": shown[name] - shown["true"].values for name in films if known}
+    off = {f"{name} less true": shown[name] - shown["true"].values for name in films if reference}
     first = next(iter(films.values()))
     rows, columns = len(times), len(shown) + len(off)
     size = (3.0 * columns, (2.4 * first.sizes["y"] / first.sizes["x"] + 0.5) * rows)
@@ -147,20 +147,20 @@ def thermocouples(scores: xr.Dataset) -> Figure:
     count = scores.sizes["scene"]
     figure, axes = canvas(1, count, (5.6 * count, 4.0))
     for axis, name in zip(axes[0], scores["scene"].values, strict=True):
-        here = scores.sel(scene=name)
-        for index, variant in enumerate(here["variant"].values):
-            part = here.sel(variant=variant)
-            error = float(part["relative_error"])
-            known = part["temperature"].dropna("time")
+        of_scene = scores.sel(scene=name)
+        for index, variant in enumerate(of_scene["variant"].values):
+            of_variant = of_scene.sel(variant=variant)
+            error = float(of_variant["relative_error"])
+            read = of_variant["temperature"].dropna("time")
             axis.plot(
-                known["time"],
-                known - zero_Celsius,
+                read["time"],
+                read - zero_Celsius,
                 color=COLORS[index % len(COLORS)],
                 linewidth=1,
                 linestyle="-" if index < len(COLORS) else "--",
                 label=f"{variant}, {error:.2g} %" if isfinite(error) else f"{variant}, no value",
             )
-        reading = here["reading"] - zero_Celsius
+        reading = of_scene["reading"] - zero_Celsius
         axis.plot(reading["time"], reading, color="black", linewidth=1.5, label="thermocouple")
         axis.set(xlabel="time [s]", title=str(name).replace("_", " "))
         axis.legend(frameon=False, fontsize=8)

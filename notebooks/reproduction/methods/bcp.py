@@ -79,18 +79,18 @@ def _remove(tile: Tile, settings: BcpSettings, band: int) -> tuple[Array, Array,
     """Object signal (time, pixel) [K], reflected signal A (time) [K], mean t (pixel), of a band."""
     cleaned = np.empty_like(tile.signals[band])
     reflected, total = np.empty(tile.time.size), np.zeros(cleaned.shape[1])
-    known = None
+    fixed = None
     if settings.reflected_temperature is not None:
         curve = tile.curves[band]
         value = require_range(settings.reflected_temperature, curve, "reflected_temperature")
-        known = float(tile.blackbody(band, value))
+        fixed = float(tile.blackbody(band, value))
     for frame, (signal, usable) in enumerate(
         zip(tile.signals[band], _usable(tile, band), strict=True)
     ):
-        some = usable.any() and not usable.all()
-        filled = np.where(usable, signal, np.median(signal[usable])) if some else signal
+        mixed = usable.any() and not usable.all()
+        filled = np.where(usable, signal, np.median(signal[usable])) if mixed else signal
         image = filled.reshape(tile.shape)
-        level = float(np.percentile(image, settings.percentile)) if known is None else known
+        level = float(np.percentile(image, settings.percentile)) if fixed is None else fixed
         transmission = _transmission(image, level, settings)
         # I' = (I - A) / max(t, t0) + A
         excess = (image - level) / np.maximum(transmission, settings.least_transmission)

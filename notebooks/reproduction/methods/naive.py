@@ -157,7 +157,7 @@ def _solve(tile: Tile, state: _State) -> tuple[Array, Array]:
     # logit alike: without it an emissivity of 0 or 1 within rounding is a singular system.
     harder, damping = 1.0 + state.damping, state.damping
     # T = ((a, b), (b, c)) frame by frame, f = J^T r
-    a, c = (np.sum(inner[:, part] ** 2, axis=0) * harder + damping for part in (0, 1))
+    a, c = (np.sum(inner[:, layer] ** 2, axis=0) * harder + damping for layer in (0, 1))
     b = np.sum(inner[:, 0] * inner[:, 1], axis=0)
     blocks = (a, b, c)
     forces = np.einsum("mktp,mtp->ktp", inner, state.residual)
@@ -182,7 +182,7 @@ def _jacobian(tile: Tile, state: _State) -> tuple[Array, Array]:
         # dz/d ln T = (e, 1 - e) u'(T) T,  dz/d logit = e (1 - e) [u(x) - u(y)]
         slopes = tile.curves[band].slope(temperatures) * temperatures / tile.noise[band]
         inner[band] = slopes * weights.T[:, np.newaxis]
-        emitted, reflected = (tile.blackbody(band, part) for part in temperatures)
+        emitted, reflected = (tile.blackbody(band, temperature) for temperature in temperatures)
         border[band] = np.prod(weights, axis=1) * (emitted - reflected) / tile.noise[band]
     return inner, border
 

@@ -68,7 +68,7 @@ def separate(tile: Tile, settings: RatioSettings) -> Estimate:
     inverse = _inverse((first, second), settings.kind)
     temperatures = (tile.temperature(band, signal) for band, signal in enumerate(tile.signals))
     pairs = zip(tile.curves, temperatures, strict=True)
-    radiances = np.stack([_radiance(curve, settings.kind, part) for curve, part in pairs])
+    radiances = np.stack([_radiance(curve, settings.kind, apparent) for curve, apparent in pairs])
     if settings.order is not None:
         functions = smooth.polynomial_basis(tile.time, settings.order)
         radiances = functions @ (functions.T @ radiances)

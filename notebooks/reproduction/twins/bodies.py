@@ -65,10 +65,10 @@ class Vessel:
         height = np.asarray(mesh.vertices)[:, 2]
         hollow = height >= self.bottom
         wall = self.thickness / (2.0 * self.solid.conductivity)
-        inside = 1.0 / (1.0 / self.wet + wall)
+        conductance = 1.0 / (1.0 / self.wet + wall)
 
         def wet(time: float) -> Array:
-            return inside * hollow * self.wetted(height, time)
+            return conductance * hollow * self.wetted(height, time)
 
         def dry(time: float) -> Array:
             return self.moist * hollow * (1.0 - self.wetted(height, time))
@@ -230,5 +230,5 @@ def rabbit(spacing: float = 0.004) -> trimesh.Trimesh:
 
     The parts are side by side; no heat flows from one to another.
     """
-    parts = [surfaces.ellipsoid(semi_axes, middle, spacing) for middle, semi_axes in RABBIT]
-    return cast("trimesh.Trimesh", trimesh.util.concatenate(parts))
+    ellipsoids = [surfaces.ellipsoid(semi_axes, middle, spacing) for middle, semi_axes in RABBIT]
+    return cast("trimesh.Trimesh", trimesh.util.concatenate(ellipsoids))

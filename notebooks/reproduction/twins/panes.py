@@ -162,8 +162,8 @@ def _waving(time: Array, rng: np.random.Generator) -> Motion:
     view, out = (-NEAR * 0.85, -NEAR, -0.03), (-NEAR * 0.85, -NEAR, -0.40)
     times, places = [float(time[0])], [np.array(out)]
     while times[-1] < time[-1]:
-        inside = np.array(view) + rng.uniform(-1.0, 1.0, (3, 3)) * (0.03, 0.0, 0.03)
-        places += [*inside, np.array(out), np.array(out)]
+        corners = np.array(view) + rng.uniform(-1.0, 1.0, (3, 3)) * (0.03, 0.0, 0.03)
+        places += [*corners, np.array(out), np.array(out)]
         times += [*(times[-1] + np.cumsum(rng.uniform(0.4, 1.6, 5)))]
     return gliding(times, places)
 

@@ -101,7 +101,7 @@ def person(route: Route, *, height: float = 0.0) -> list[Actor]:
     return actors
 
 
-def _walking(part: Actor, route: Route, floor: float, joint: float, swing: float) -> Actor:
+def _walking(limb: Actor, route: Route, floor: float, joint: float, swing: float) -> Actor:
     """Part of a body on its route, swinging in step about a joint at a height."""
 
     @cache  # two cameras ask for each time
@@ -110,7 +110,7 @@ def _walking(part: Actor, route: Route, floor: float, joint: float, swing: float
         angle = Rotation.from_euler("y", swing * np.sin(route.phase(time)))
         return Pose(upright, (*route.place(time), floor)) @ hinged((0.0, 0.0, joint), angle)
 
-    return Actor(part.mesh, part.temperature, motion)
+    return Actor(limb.mesh, limb.temperature, motion)
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,7 @@ def imprint(places: npt.ArrayLike, softness: float = 0.002) -> Array:
     places = np.asarray(places, dtype=np.float64)
     scale = np.linalg.norm(places / (PALM[0], PALM[2]), axis=1)
     palm = (1.0 - scale) * min(PALM[0], PALM[2])
-    fingers = [part.radius - _to_segment(places, part.root, part.tip) for part in FINGERS]
+    fingers = [finger.radius - _to_segment(places, finger.root, finger.tip) for finger in FINGERS]
     return np.asarray(0.5 * (1.0 + np.tanh(np.max([palm, *fingers], axis=0) / softness)))
 
 

@@ -80,10 +80,10 @@ class Actor:
         return self.temperature(time) if callable(self.temperature) else self.temperature
 
 
-def painted(parts: Sequence[tuple[trimesh.Trimesh, float]], motion: Motion | None = None) -> Actor:
+def painted(meshes: Sequence[tuple[trimesh.Trimesh, float]], motion: Motion | None = None) -> Actor:
     """Rigid actor of several meshes, each of one temperature [K], side by side."""
-    warmth = [np.full(len(mesh.vertices), temperature) for mesh, temperature in parts]
-    whole = trimesh.util.concatenate([mesh for mesh, _ in parts])
+    warmth = [np.full(len(mesh.vertices), temperature) for mesh, temperature in meshes]
+    whole = trimesh.util.concatenate([mesh for mesh, _ in meshes])
     return Actor(cast("trimesh.Trimesh", whole), np.concatenate(warmth), motion)
 
 
@@ -113,8 +113,8 @@ def _approaching(rays: Rays, sphere: tuple[Array, float], pose: Rays, box: Rays)
                 origin += (origins[ray, k] - place[k]) * rotation[k, axis]
                 direction += directions[ray, k] * rotation[k, axis]
             inwards[0, count, axis], inwards[1, count, axis] = origin, direction
-            one, other = (low[axis] - origin) / direction, (high[axis] - origin) / direction
-            enter, leave = max(enter, min(one, other)), min(leave, max(one, other))
+            near, far = (low[axis] - origin) / direction, (high[axis] - origin) / direction
+            enter, leave = max(enter, min(near, far)), min(leave, max(near, far))
         if not enter > leave:  # NaN: along a face
             numbers[count] = ray
             count += 1
