@@ -81,11 +81,11 @@ class Pane:
 
     def cut(self, box: tuple[slice, ...], progress: Progress | None) -> "Pane":
         """Pane of some rows and columns: if they are few, no more of a film is copied."""
-        part = replace(self, array=self.array.isel(y=box[0], x=box[1]))
-        if "_source" in vars(self) or _FEW * part.array.size > self.array.size:
+        pane = replace(self, array=self.array.isel(y=box[0], x=box[1]))
+        if "_source" in vars(self) or _FEW * pane.array.size > self.array.size:
             self.stage(progress)
-            vars(part)["_source"] = self._source[:, *box]
-        return part
+            vars(pane)["_source"] = self._source[:, *box]
+        return pane
 
     def read(
         self, frames: slice, rows: slice = slice(None), columns: slice = slice(None)
@@ -221,14 +221,14 @@ class Region:
                     along = (rows[spanned] - row) / (end - row)
                     odd[spanned] ^= columns < column + along * (far - column)
             return odd
-        (top, left), (bottom, right) = outline.min(axis=0), outline.max(axis=0)
+        (top, first), (bottom, last) = outline.min(axis=0), outline.max(axis=0)
         if self.kind == "rectangle":
-            within = (top <= rows) & (rows < bottom) & (left <= columns) & (columns < right)
-        elif top == bottom or left == right:
+            within = (top <= rows) & (rows < bottom) & (first <= columns) & (columns < last)
+        elif top == bottom or first == last:
             within = np.zeros(shape, dtype=bool)
-        else:
+        else:  # distances from the middle, in half axes
             down = (2.0 * rows - top - bottom) / (bottom - top)
-            within = down**2 + ((2.0 * columns - left - right) / (right - left)) ** 2 <= 1.0
+            within = down**2 + ((2.0 * columns - first - last) / (last - first)) ** 2 <= 1.0
         return np.asarray(within)
 
 
@@ -250,12 +250,15 @@ def common_gain(emissivity: Array, covariance: Array) -> Array:
     differs between pixels by more than the deviations. NaN where the emissivities are.
     """
     finite = np.isfinite(emissivity).all(axis=0) & np.isfinite(covariance).all(axis=(0, 1))
+    # Any system that can be inverted stands in for a pixel without a value.
     default = np.linspace(0.4, 0.6, len(emissivity))[:, np.newaxis, np.newaxis]
     value = np.where(finite, emissivity, default)
+    # v = g cov(e) g^T, with g of the pseudoinverse of (e_b, 1 - e_b)
     system = np.moveaxis(np.stack([value, 1.0 - value], axis=-1), 0, 2)  # (y, x, band, 2)
     inverse = np.linalg.pinv(system)  # (y, x, 2, band)
     variance = np.einsum("yxib,bcyx,yxic->iyx", inverse, covariance, inverse)
     variance = np.where(finite, np.maximum(variance, 0.0), np.nan)
+    # Squared steps from neighbour to neighbour, over the variance of independent errors.
     ratios = []
     for axis in (0, 1):
         first, second = np.delete(inverse, -1, axis), np.delete(inverse, 0, axis)
@@ -267,12 +270,14 @@ def common_gain(emissivity: Array, covariance: Array) -> Array:
     residual_share = np.zeros(2)
     if pairs.shape[1] >= _LEAST_PAIRS:
         residual_share = np.median(pairs, axis=1) / chdtri(1, 0.5)
+    # Larger steps are of the material: then all of the error counts as common.
     shared = np.where(residual_share < _LARGEST_SHARE, 1.0 - np.minimum(residual_share, 1.0), 1.0)
     return np.asarray(np.sqrt(shared[:, np.newaxis, np.newaxis] * variance))
 
 
 def mean_std(std: Array, common: Array) -> Array:
     """Standard deviation (time) of a mean over pixels with a common part, see `View.curve`."""
+    # s^2 = (sum_i c_i / n)^2 + sum_i (s_i^2 - c_i^2) / n^2
     shared = np.where(np.isfinite(common), np.minimum(common, std), std)
     number = np.maximum(np.isfinite(std).sum(axis=-1), 1)
     independent = np.nansum(std**2 - shared**2, axis=-1) / number**2

@@ -76,6 +76,7 @@ class View:
     ) -> None:
         self.progress: Progress | None = None
         self.data = _films.opened(data, "data")
+        # The data may be a capture alone, which is then its own input.
         is_capture = "object_temperature" not in self.data and "counts" in self.data
         self.capture = None if capture is None else _films.opened(capture, "capture")
         self.response = None if response is None else _films.opened(response, "response")
@@ -84,6 +85,7 @@ class View:
             raise ValueError("Invalid second capture. The data are a capture: must be a result.")
         if is_capture:
             self.capture, sources = self.data, {"capture": data, "response": response}
+        # What the code that is copied opens: a path, or the name of what is in memory.
         self.sources = {
             name: repr(str(source)) if isinstance(source, str | Path) else name
             for name, source in sources.items()
@@ -113,10 +115,7 @@ class View:
         return self.panes[name]
 
     def frame(self, name: str, index: int) -> Values:
-        """Values (y, x) of a pane at a frame, from 0, in its units; of a map at any frame.
-
-        ValueError if there is no such pane or frame.
-        """
+        """Values (y, x) of a pane at a frame, from 0; ValueError if there is no such one."""
         if not 0 <= index < self.time.size:
             raise ValueError(f"Invalid frame {index}. Must be from 0 to {self.time.size - 1}.")
         return np.asarray(self.pane(name).read(slice(index, index + 1))[0])
@@ -142,11 +141,7 @@ class View:
         return good | ((self.status & COMPLETED) != 0) if pixels == "unflagged" else good
 
     def limits(self, name: str) -> tuple[float, float]:
-        """Range of colour of a pane: the 1st and 99th percentile of some measured values.
-
-        Of all values if none is measured; a deviation begins at 0, and that of emissivities is
-        wider by their median deviation.
-        """
+        """Range of colour of a pane: 1st and 99th percentile of some values, measured if any is."""
         pane, (frames, pixels) = self.pane(name), _RANGE
         times = slice(0, None, -(-self.time.size // frames))
         every = slice(0, None, stride(self.shape, pixels))
@@ -156,7 +151,7 @@ class View:
             if finite.size:
                 low, high = np.percentile(finite, [1, 99])
                 low = 0.0 if "_std" in name else low
-                if pane.std and not pane.absolute:  # differences within the bars are no colours
+                if pane.std and not pane.absolute:  # emissivities within their bars are alike
                     bars = self.pane(pane.std).read(times, every, every)[np.isfinite(values)]
                     low, high = low - np.median(bars), high + np.median(bars)
                 return float(low), float(high if high > low else low + (1e-3 * abs(low) or 1.0))
@@ -247,6 +242,7 @@ class View:
         estimated = {"emissivity", "emissivity_std"} <= set(data) and {*FILMS} <= set(self.panes)
         if pane.name not in FILMS or displaced or not estimated:
             return None
+        # Without a covariance the bands' errors are independent.
         cut = data[[name for name in data if str(name).startswith("emissivity")]]
         cut = cut.isel(y=rows, x=columns)
         if "emissivity_covariance" in data:
@@ -254,6 +250,7 @@ class View:
         else:
             variance = cut["emissivity_std"].values ** 2
             covariance = np.eye(len(variance))[..., None, None] * variance
+        # A completed pixel has its emissivities of other pixels.
         measured = where & ((self.status[box] & COMPLETED) == 0)
         gains = _films.common_gain(np.where(measured, cut["emissivity"].values, np.nan), covariance)
         return np.asarray(gains[list(FILMS).index(pane.name)][where])
@@ -262,10 +259,10 @@ class View:
         """Deviation of the samples of a pane by the calibration, which the whole image shares."""
         budget, response = schema.BUDGETS.get(pane.name.partition(" ")[0]), self.response
         if budget in self.data:
-            parts = self.data[budget].isel(y=box[0], x=box[1]).sel(cause=[*schema.SHARED])
-            if "band" in parts.dims:
-                parts = parts.sel(band=pane.name.partition(" ")[2])
-            squares = (parts.values[:, where].astype(np.float64) ** 2).sum(axis=0)
+            stds = self.data[budget].isel(y=box[0], x=box[1]).sel(cause=[*schema.SHARED])
+            if "band" in stds.dims:
+                stds = stds.sel(band=pane.name.partition(" ")[2])
+            squares = (stds.values[:, where].astype(np.float64) ** 2).sum(axis=0)
             return np.asarray(np.broadcast_to(np.sqrt(squares), values.shape))
         if response is None or pane.curve is None:
             return np.zeros(values.shape)
@@ -289,6 +286,7 @@ class View:
         std = np.hypot(of(stated[0]) * factor, pattern)
         if pane.curve is None:
             return np.full(values.shape, std)
+        # s_T = s_I / U'(T)
         return np.asarray(std / pane.curve.count_slope(values))
 
     def probe(self, names: Sequence[str], index: int, row: int, column: int) -> dict[str, Any]:

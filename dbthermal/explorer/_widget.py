@@ -48,12 +48,8 @@ class Explorer(anywidget.AnyWidget):
     Parameters
     ----------
     view, celsius : View, bool
-        What is shown; True for degrees Celsius instead of kelvin.
-
-    Attributes
-    ----------
-    view, regions : View, dict of str to Region
-        What is shown, and regions by name, as they are drawn.
+        What is shown, later in `view` beside the `regions` by name, as they are drawn; True for
+        degrees Celsius instead of kelvin.
     """
 
     _esm, _css = (Path(__file__).with_name(f"explorer.{kind}") for kind in ("js", "css"))
@@ -67,10 +63,7 @@ class Explorer(anywidget.AnyWidget):
         self.on_msg(self._on_message)
 
     def curves(self, name: str = "") -> xr.Dataset:
-        """Curves over (region, time) of the regions drawn, in a pane or else the plotted one.
-
-        As `View.curve`; ValueError if there is no such pane, or no region.
-        """
+        """Curves over (region, time) of the regions drawn, as `View.curve`; ValueError without."""
         name = name or self._state.get("pane") or next(iter(self.view.panes))
         return _export.curves(self.view, name, self.regions, self._state["pixels"])
 
@@ -148,10 +141,12 @@ class Explorer(anywidget.AnyWidget):
         frames = {name: self._frame(name, request) for name in names}
         limits = [*zip(names, request["limits"], strict=True)]
         ranges = {name: limit or self._range(name) for name, limit in limits}
+        # Differences from a frame of reference lie about 0.
         for name, limit in limits if less is not None else ():
             if limit is None and self.view.panes[name].kind == "film":
                 reach = 0.5 * (self._range(name)[1] - self._range(name)[0])
                 ranges[name] = (-reach, reach)
+        # The isotherm is drawn on temperatures alone.
         lined = names if level is not None and less is None else []
         lined = [name for name in lined if self.view.panes[name].absolute]
         sides = [

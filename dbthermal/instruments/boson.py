@@ -247,8 +247,7 @@ class Boson(Closing):
     """A camera's command port, a `camera.CameraControl`; for any number of threads.
 
     Each method raises `BosonTimeoutError` if no reply comes, `BosonError` if a wrong one does or
-    the camera refuses, and `TransportError` if it is gone. A reading is requested again if no reply
-    comes; a command that changes the camera never is.
+    the camera refuses, and `TransportError` if it is gone.
 
     Examples
     --------
@@ -339,12 +338,9 @@ class Boson(Closing):
                 raise ValueError(f"{label}, set to {value!r}. Must be as it was set.")
 
     def run_ffc(self, *, timeout: float = FFC_TIMEOUT) -> int:
-        """Run a flat-field correction, wait until it is complete, return its frame number.
-
-        At its start the status is still "complete", of the correction before: it must change, or
-        the frame number of the last correction must. While the shutter is closed the camera may
-        not answer; `BosonTimeoutError` after `timeout` [s].
-        """
+        """Run a flat-field correction, return its frame; BosonTimeoutError after `timeout` [s]."""
+        # At its start the status is still "complete", of the correction before: it must change, or
+        # the frame number of the last correction must.
         before = self.read(LAST_FFC_FRAME)
         changed = self.ffc_status() != FfcStatus.COMPLETE
         self._command("run FFC", RUN_FFC)

@@ -43,12 +43,9 @@ class Devices:
         return SYSTEM if self.world is None else self.world.clock
 
     def readings(self) -> dict[str, Reading]:
-        """Instruments that are read beside the frames, for `recording.record`.
-
-        Each thermocouple by its name [K]; ``fpa <band>``, the temperature of the focal-plane array
-        [K]; ``ffc <band>``, a `camera.FfcStatus`; ``filter_wheel``, the slot in the beam.
-        """
+        """Instruments that are read beside the frames, by name, for `recording.record`."""
         readings: dict[str, Reading] = {}
+        # Thermocouples [K], focal-plane arrays [K], states of shutters, and the slot in the beam.
         if (logger := self.thermocouples) is not None:
             for channel, name in logger.channels.items():
                 readings[name] = Reading(partial(logger.read, channel))
@@ -84,9 +81,8 @@ class Devices:
     def prepare(self) -> None:
         """Set the cameras, correct their offsets, home the wheel if need be, turn it to its band.
 
-        Cameras give 16-bit counts, correct their offsets on command only, and give the session's
-        telemetry. ValueError if a camera does not keep a setting, RuntimeError or OSError if a
-        device refuses, fails or is gone.
+        ValueError if a camera does not keep a setting, see `CameraControl.prepare`; RuntimeError or
+        OSError if a device refuses, fails or is gone.
         """
         for camera in self.cameras.values():
             camera.prepare(self.session.telemetry_rows)

@@ -81,15 +81,13 @@ Speed = Annotated[float, Field(strict=True, ge=0.1, le=90.0)]
 
 @checked_dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class Settings:
-    """Properties of a wheel and its controller; ValueError if one is out of its range.
-
-    Which direction and switch a wheel needs is uncertain: None keeps what the controller has.
-    """
+    """Properties of a wheel and its controller; ValueError if one is out of its range."""
 
     # Of the controller; any other is then refused.
     serial_number: Annotated[int, Field(strict=True, ge=1, lt=2**32)] | None = None
     # From the home position to slot 1 [deg]; differs by wheel: look.
     home_offset: Annotated[float, Field(strict=True, gt=-360.0, lt=360.0)] = 0.0
+    # Which direction and switch a wheel needs is uncertain: None keeps what the controller has.
     home_direction: Literal[1, 2] | None = None  # 1 forward, 2 reverse
     home_limit_switch: Literal[1, 4] | None = None  # 1 the reverse switch, 4 the forward one
     velocity: Speed = 1.0  # [turn/s]
@@ -189,7 +187,7 @@ class FilterWheel(Closing):
         return apt.parse(apt.Status, self._controller.request(Id.MOT_REQ_STATUSUPDATE))
 
     def home(self) -> None:
-        """Search for the home switch, from which all places count; raises as `move_to`."""
+        """Search for the home switch, where places count from; StalledWheelError, WheelError."""
         self.identity()
         self._prepare()
         self._resting(homed=False)

@@ -187,8 +187,7 @@ class Separation:
     """Live separation of the pairs of frames that a view is shown, for its `separation`.
 
     `stream` is a `separation.Stream` at the rate of the previews, ``Limits.preview_period``, and
-    `correction` from `correction.fit_correction` has its bands. Frames of a closed shutter are left
-    out, and pairs of which a frame was shown before.
+    `correction` from `correction.fit_correction` has its bands.
     """
 
     def __init__(self, stream: "Stream", correction: xr.Dataset) -> None:
@@ -201,6 +200,7 @@ class Separation:
         """Take the last frames; return the temperatures by now, None before the first."""
         frames = [preview.frames[band] for band in self._bands if band in preview.frames]
         times = {band: frame.host_time for band, frame in preview.frames.items()}
+        # Left out are frames of a closed shutter, and pairs of which a frame was shown before.
         fresh = all(times.get(band, -math.inf) > shown for band, shown in self._shown.items())
         if fresh and not any(FrameFlag.SHUTTER_CLOSED in frame.flags for frame in frames):
             self._shown = {band: times[band] for band in self._bands}
@@ -282,16 +282,15 @@ class View:
 
 def _temperature(name: str, separated: xr.Dataset | None, empty: Array) -> "Panel":
     """Panel of the last temperatures of a separation."""
-    from dbthermal.figures import Panel  # noqa: PLC0415 - loads matplotlib
+    from dbthermal.figures import Panel, drawing  # noqa: PLC0415 - loads matplotlib
 
     if separated is None:
         return Panel(empty, (0.0, 1.0), "not known yet", is_temperature=True)
-    image = separated[f"{name}_temperature"].values[-1] - zero_Celsius
+    image = separated[f"{name}_temperature"][-1] - zero_Celsius
     good = 100 * float((separated["status"] == 0).mean())
-    finite = image[np.isfinite(image)]
-    low, high = np.percentile(finite, _PERCENTILES) if finite.size else (0.0, 1.0)
+    low, high = drawing.limits_of(image)
     limits, text = (low, max(high, low + 0.1)), f"{good:.0f} % of the pixels without a flag"
-    return Panel(image, limits, text, is_temperature=True)
+    return Panel(image.values, limits, text, is_temperature=True)
 
 
 def _foot(preview: Preview) -> str:

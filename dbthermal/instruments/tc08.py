@@ -106,17 +106,11 @@ SIGNATURES: Final = MappingProxyType(
 
 
 class Scan(NamedTuple):
-    """A reading of all nine channels, of which index 0 is the cold junction.
+    """A reading of all nine channels, of which index 0 is the cold junction."""
 
-    `time` is the middle of the scan on the host's clock [s], for the channels are converted one
-    after another. `temperature` (9,) [K] is NaN where the voltage was beyond the converter's range,
-    which `overflow` (9,) says, where the thermocouple is open or the channel off, and where the
-    library gives none above 0 K.
-    """
-
-    time: float
-    temperature: npt.NDArray[np.float64]
-    overflow: npt.NDArray[np.bool_]
+    time: float  # middle of the conversion of one channel after another, on the host's clock [s]
+    temperature: npt.NDArray[np.float64]  # (9,) [K]; NaN if open, off, beyond range, not above 0 K
+    overflow: npt.NDArray[np.bool_]  # (9,) True where the voltage was beyond the converter's range
 
 
 class TC08(Closing):
@@ -154,11 +148,7 @@ class TC08(Closing):
         return cls(load()).open()
 
     def open(self, *, timeout: float = OPEN_TIMEOUT) -> Self:
-        """Open the first free unit, within `timeout` [s].
-
-        RuntimeError or ConnectionError if it is open already, or no unit is free; TC08Error or
-        TimeoutError if the library fails, or the firmware is not downloaded in time.
-        """
+        """Open the first free unit in `timeout` [s]; TimeoutError, OSError or RuntimeError."""
         if self._handle:
             raise RuntimeError("The TC-08 is open already. Must be closed first.")
         if not self._library.usb_tc08_open_unit_async():

@@ -64,7 +64,7 @@ _ROW = np.dtype(
 
 
 def decode(rows: Counts) -> dict[str, float]:
-    """Read each of `FIELDS` from telemetry, uint16 (row, x) or (word,), of `WORDS` or more."""
+    """Read each of `FIELDS` from telemetry, uint16 (row, x) or (word,); TypeError, ValueError."""
     # There is no checksum: any content is read as if it were telemetry.
     (numbers,) = _checked(rows)[:WORDS].astype(">u2").view(_ROW).tolist()
     return {

@@ -1,8 +1,7 @@
 """Addresses of devices, byte streams to those on a serial line, and the clock of all of them.
 
 ``serial:///dev/ttyACM0`` is a serial port (``serial://COM3`` on Windows); `parse` has the rules of
-all addresses. An address never names a program or a library: an environment variable names that of
-the TC-08.
+all addresses, none of which names a program or a library.
 
 Drivers and recorder take the time, wait, and start their threads by a `Clock` alone: `SYSTEM` for
 hardware, an `EmulatedClock` for emulated devices. On the latter a single thread runs at a time.
@@ -350,11 +349,11 @@ def _named(action: str, port: str, rule: str = "The device must stay connected")
 def open_serial(url: str, *, baudrate: int, rtscts: bool = False) -> SerialTransport:
     """Open the line to a device by its address, for this program alone; nothing is sent.
 
-    `baudrate` [bit/s] is the speed of the line. With `rtscts` its flow is controlled by RTS and
-    CTS, and RTS is taken down and up once. ValueError for another address, or a pseudo-terminal,
-    which would let an emulator pass for hardware; TransportError if the port cannot be opened.
+    Speed [bit/s], and whether RTS and CTS control its flow, RTS being taken down and up once.
+    ValueError for another address, TransportError if the port cannot be opened.
     """
     path = parse(url, "serial")
+    # A pseudo-terminal would let an emulator pass for hardware.
     if Path(path).resolve().is_relative_to("/dev/pts"):
         raise ValueError(f"Invalid address '{url}', a pseudo-terminal. Must be a device's port.")
 

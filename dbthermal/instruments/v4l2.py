@@ -88,10 +88,8 @@ class Kernel:
 class Capture(Closing):
     """A camera's node that streams Y16 frames, a `camera.FrameSource`; nothing is reset.
 
-    `decode` reads the metadata of a frame from its telemetry rows. Its identity is the node, name
-    and bus of the camera, and the driver with its version, on which a stamp's meaning depends.
     OSError if the node cannot be opened or is busy; ValueError if it gives no Y16, or another
-    format or rate.
+    format or rate. `decode` reads the metadata of a frame from its telemetry rows.
     """
 
     is_simulated = False
@@ -243,7 +241,7 @@ def _buffer(index: int) -> tuple[int, ...]:
 
 
 def open_url(url: str, stream: Stream, decode: Decode | None = None) -> Capture:
-    """Open the node of an address ``v4l2:///dev/video0``, on Linux; ValueError or OSError."""
+    """Open the node of an address ``v4l2:///dev/video0``; ValueError, OSError if not on Linux."""
     node = parse(url, "v4l2")
     if not sys.platform.startswith("linux"):
         raise OSError(f"No video on '{sys.platform}'. Must be Linux, for V4L2.")

@@ -114,8 +114,7 @@ def smallest_order(truth: Truth, sensitivity: Sensitivity) -> Indices:
     .. math:: \sum_t r(t)^2 \, p(t)^T W(t) \, p(t) \le 0.1 \qquad (3)
 
     with p the emission. It shifts no quantity by more than the root, 0.32, of that quantity's own
-    bound (Cauchy and Schwarz). Without rest and with two bands this is the energy of
-    :math:`z_2 - k_2 z_1`, which holds no background, over the variance of its noise.
+    bound (Cauchy and Schwarz).
     """
     highest = min(_HIGHEST_ORDER, truth.time.size)
     functions = _smooth.polynomial_basis(truth.time, highest)

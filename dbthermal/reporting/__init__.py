@@ -140,6 +140,7 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
         "regions": {name: _summary(of, table_) for name, of in curves.items()},
     }
     made_by = result.attrs.get("provenance", {}) if provenance is None else provenance
+    # What was found, by whom, and what speaks against it.
     sentences, numbers["answer"] = answer(result, table_)
     about = [author, *(str(shot.attrs.get(name, "")) for name in ("source", "start"))]
     doubts = [*result.attrs.get("warnings", []), *hardly_measured(result)]
@@ -347,6 +348,7 @@ def video(
     with TemporaryDirectory() as folder:
         path, poster = Path(folder) / "film.mp4", Path(folder) / "middle.png"
         store.save_video(frames(), path, {}, rate=rate, codec=codec)
+        # A film that is too large for a letter has half as many frames.
         if path.stat().st_size > _LARGEST and number > 2:
             return video(view, title, codec, celsius=celsius, number=number // 2)
         mpl.image.imsave(poster, middle[0])
@@ -367,6 +369,7 @@ def viewer(view: View, *, celsius: bool) -> dict[str, Any]:
         shown = np.percentile(finite, [1, 99]).tolist() if finite.size else [low, high]
         shown = [0.0 if name in stds else shown[0], max(shown[1], shown[0] + _LEAST)]
         high = high if high > low else low + 1.0
+        # Values as whole numbers of 16 bits, the largest of which has none.
         scaled = np.nan_to_num((values - low) / (high - low)) * (_NO_VALUE - 1)
         codes = np.where(np.isfinite(values), np.rint(scaled), _NO_VALUE).astype("<u2")
         # Changes from frame to frame, low bytes before high ones, which compress well.

@@ -11,6 +11,7 @@ from dialogue import Dialogue, Pair
 from faulty_devices import BosonBench, reply, request, text
 from hypothesis import given
 from hypothesis import strategies as st
+from test_codecs import FRAMES
 
 from dbthermal.instruments import boson
 from dbthermal.instruments.boson import (
@@ -52,11 +53,8 @@ STATUSES = [
     *range(0x6A4, 0x6AE),
 ]
 SERIAL, PART, FPA, SET_GAIN, STATUS = 0x50002, 0x50004, 0x50030, 0x50014, 0x50054
-# Quoted in thurberdog/ghostCommand: serial number 93588.
-SERIAL_REQUEST = bytes.fromhex("8E 00 00 00 00 01 00 05 00 02 FF FF FF FF 01 0B AE")
-SERIAL_REPLY = bytes.fromhex("8E 00 00 00 00 01 00 05 00 02 00 00 00 00 00 01 6D 94 30 10 AE")
-# 43.1 °C, with an escaped checksum: LJMUAstroecology/flirpy, issue 21.
-ESCAPED_REPLY = bytes.fromhex("8E 00 00 00 00 00 00 05 00 30 00 00 00 00 01 AF 9E 91 99 AE")
+# Public frames: serial number 93588, and 43.1 °C with an escaped checksum.
+SERIAL_REQUEST, SERIAL_REPLY, ESCAPED_REPLY, *_ = map(bytes.fromhex, FRAMES)
 
 
 @pytest.fixture

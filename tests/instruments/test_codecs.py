@@ -2,11 +2,12 @@
 
 import struct
 from itertools import pairwise
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from refused import refused
 
 from dbthermal.instruments import _apt as apt
 from dbthermal.instruments import boson
@@ -264,32 +265,22 @@ def test_the_longest_frame_is_read(size: int) -> None:
     assert len(boson.Decoder().feed(sent)) == (size == 2048)
 
 
-UNFIT: list[tuple[Any, str]] = [
-    (lambda: apt.encode(Message(0x10000, 0, 0, 1, 1)), "id=65536,.* fields must hold it"),
-    (lambda: apt.encode(Message(1, 0, 0, 0x80, 1)), "destination=128,.* below 128"),
-    (lambda: apt.encode(Message(1, 0, 0, 1, 1, bytes(256))), "at most 255 bytes of data"),
-    (lambda: apt.encode(Message(1, 0, 1, 1, 1, b"x")), "parameters must be 0"),
-    (lambda: apt.pack(apt.Position(1, 2**31)), r"Position\(channel=1, position=2147483648\)"),
-    (lambda: apt.encode(Message(Id.MOT_SET_VELPARAMS)), "0 bytes of MOT_SET_VELPARAMS"),
-    (
-        lambda: boson.encode(Packet(0, 0, 0, 0, bytes(752))),
-        "data of 752 bytes. Must be at most 751",
-    ),
-]
-
-
-@pytest.mark.parametrize(("build", "message"), UNFIT)
-def test_what_does_not_fit_is_refused(build: Any, message: str) -> None:
-    """Numbers that do not fit their field are errors, and never rounded into it."""
-    with pytest.raises(ValueError, match=f"Invalid .*{message}"):
-        build()
-
-
-@pytest.mark.parametrize("numbers", [(1 << 32, 0), (0, -1), (0, 1.5)])
-def test_numbers_of_a_frame_fit(numbers: tuple[Any, Any]) -> None:
-    """A sequence number and a command that do not fit, or are not whole, are never rounded."""
-    with pytest.raises(struct.error):
-        boson.encode(Packet(0, *numbers, 0))
+# Numbers that do not fit their field, or are not whole, are errors, and never rounded into it.
+test_what_does_not_fit_is_refused = refused(
+    lambda encode, *content: encode(*content),
+    [
+        (apt.encode, Message(0x10000, 0, 0, 1, 1), "Invalid .*id=65536,.* fields must hold it"),
+        (apt.encode, Message(1, 0, 0, 0x80, 1), "Invalid .*destination=128,.* below 128"),
+        (apt.encode, Message(1, 0, 0, 1, 1, bytes(256)), "Invalid .*at most 255 bytes of data"),
+        (apt.encode, Message(1, 0, 1, 1, 1, b"x"), "Invalid .*parameters must be 0"),
+        (apt.pack, apt.Position(1, 2**31), "Invalid Position(channel=1, position=2147483648)"),
+        (apt.encode, Message(Id.MOT_SET_VELPARAMS), "Invalid .* 0 bytes of MOT_SET_VELPARAMS"),
+        (boson.encode, Packet(0, 0, 0, 0, bytes(752)), "of 752 bytes. Must be at most 751"),
+        *((boson.encode, Packet(0, *it, 0), "format|range") for it in ((1 << 32, 0), (0, -1))),
+        (boson.encode, Packet(0, 0, cast(Any, 1.5), 0), "integer"),
+    ],
+    error=(ValueError, struct.error),
+)
 
 
 @given(st.integers(0, (1 << 32) - 1))
