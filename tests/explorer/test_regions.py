@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from refused import refused
 
@@ -23,6 +23,7 @@ def test_areas() -> None:
 
 
 @given(coordinates, coordinates)
+@example((0.5, 0.5), (2.5, 3.5))  # through the centres of pixels
 def test_a_rectangle_is_a_polygon_of_four_corners(
     first: tuple[float, float], last: tuple[float, float]
 ) -> None:

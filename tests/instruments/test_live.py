@@ -262,6 +262,8 @@ def test_a_separation_is_shown_beside_the_frames() -> None:
     assert view.figure is not None
     titles = [axis.get_title() for axis in view.figure.axes]
     assert titles[2:4] == ["object", "background"]
+    low, high = view.figure.axes[2].images[0].get_clim()
+    assert 20 < low < high < 65  # degrees Celsius
 
 
 def test_recording_without_a_notebook(tmp_path: Path) -> None:

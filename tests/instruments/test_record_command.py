@@ -71,6 +71,7 @@ def test_scene_of_a_simulated_blackbody(tmp_path: Path) -> None:
     capture = open_capture(tmp_path / "recorded" / "plate.zarr")
     assert capture.attrs["is_simulated"] is True
     assert float(capture["counts"].std("x").mean()) > 1
+    assert float(capture["counts"].std("time").mean()) > 1  # noise of the frames
 
 
 def test_a_recording_is_described(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
