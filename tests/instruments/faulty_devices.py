@@ -322,10 +322,6 @@ class WheelBench:
         self.wheel.home()
         return self.wheel
 
-    def move(self, position: int) -> None:
-        """Move the motor without the driver."""
-        self.device.turn_to(position)
-
 
 class LoggerBench:
     """A driver on an emulated unit, a clock, and tips whose temperatures a test sets."""

@@ -56,7 +56,7 @@ def test_slots_of_any_turn(turns: int) -> None:
     """A wheel that was turned on, by a whole turn and a sixth, has the next slot in the beam."""
     bench = WheelBench()
     wheel = bench.homed()
-    bench.move(turns * (409_600 + 68_267))
+    bench.device.turn_to(turns * (409_600 + 68_267))
     bench.clock.sleep(30.0)
     assert wheel.position() == bench.world.wheel_position == (2 if turns > 0 else 6)
 
@@ -84,7 +84,7 @@ def test_a_wheel_that_turns_or_rests_between_two_slots() -> None:
     """It has no position and no filter in the beam, and is moved again once it was stopped."""
     bench = WheelBench()
     wheel = bench.homed()
-    bench.move(200_000)
+    bench.device.turn_to(200_000)
     assert bench.world.wheel_position is None
     with pytest.raises(WheelError, match="still moving"):
         wheel.position()
