@@ -152,11 +152,11 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     laid = overlay(corrected, inputs)
     shift = laid.remaining_shift(reflection_shift) if laid else reflection_shift
 
-    def once(capture: xr.Dataset) -> tuple[Measured, Misfit]:
+    def once(capture: xr.Dataset, field: xr.Dataset | None = shift) -> tuple[Measured, Misfit]:
         scope = inputs
         if capture is not corrected:
             scope = check(capture, response, inputs.method, settings=settings)
-        measured = _separated(capture, scope, shift, materials, workers, progress)
+        measured = _separated(capture, scope, field, materials, workers, progress)
         return measured, misfits.measure(
             measured.inputs, measured.result, workers, drift, sharpness
         )
@@ -260,7 +260,8 @@ def _mended(
     misfit = replace(misfit, change=np.hypot(misfit.change, remainder))
     outcome = measured, misfit
     alike = equalise(capture, measured.inputs, measured.result, misfit)
-    retry = None if alike is None else once(alike.capture)
+    # A blur leaves the shift as it is, but less of the texture that tells it.
+    retry = None if alike is None else once(alike.capture, measured.reflection_shift)
     if alike and retry and retry[0].sound > _KEPT * measured.sound:
         measured, less = retry
         # Noise that is not white is told before: a blur takes rapid noise alone.
