@@ -126,11 +126,8 @@ _METHODS: Final = (
     "subspace (first step of the default), calibrated (emissivities as stated), "
     "apparent (temperature as of a black body)"
 )
-_OUTPUTS: Final = {
-    "export": "file *.csv, *.tif, *.nc, *.gif, *.webp, *.png, *.pdf or *.svg",
-    "explore": "notebook *.ipynb",
-    "report": "page *.html",
-}
+_OUTPUTS: Final = {"explore": "notebook *.ipynb", "report": "page *.html"}
+_OUTPUTS["export"] = "file *.csv, *.tif, *.nc, *.gif, *.webp, *.png, *.pdf or *.svg"
 """Command -> kind of its output, if that is no store."""
 
 _FORM: Final = "--unit --clock --shape --byte-order --header --frame-header --variable --simulated"

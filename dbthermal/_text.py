@@ -50,7 +50,8 @@ def as_path(path: Any) -> Path:
 
 def regular_file(path: str | Path, limit: int) -> Path:
     """Path of a regular file of at most `limit` bytes; others are refused without being opened."""
-    path = as_path(path)
+    if not (path := as_path(path)).exists():
+        raise FileNotFoundError(f"No file or folder '{path}'. Must exist, without '*' or '~'.")
     state = path.stat()
     if not stat.S_ISREG(state.st_mode):
         kind = "folder" if stat.S_ISDIR(state.st_mode) else "pipe, socket or device"

@@ -212,6 +212,7 @@ def accuracy(
     """
     places, stated = schema.band_positions(response, bands, "the response"), dict[str, Array]()
     limits = {"blackbody_emissivity": (1e-3, 1.0), "room_temperature": _numbers.KELVIN}
+    limits |= {"gain_std": (0.0, 1.0), "background_ratio_std": (0.0, 1.0)}  # relative, not in %
     for name, default in ACCURACY.items():
         value = np.asarray(response[name].values if name in response else default, np.float64)
         stated[name], within = value, limits.get(name, (0.0, schema.LARGEST))

@@ -58,13 +58,10 @@ def glass() -> tuple[xr.Dataset, xr.Dataset, xr.Dataset]:
     """Scene, capture and response: glass 0.86/0.72, 20 pixels as an image of 4 by 5."""
     rig, time, rng = Rig(), np.arange(350) / 10.0, np.random.default_rng(11)
     emissivity = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(rig.bands)})
-    flat = simulation.independent_pixels(
-        time, emissivity, Background(), 20, rng, start=293.15, stop=333.15
-    )
-    warm, cold = (
-        flat[name].values.reshape(350, 4, 5)
-        for name in ("object_temperature", "background_temperature")
-    )
+    make = simulation.independent_pixels
+    flat = make(time, emissivity, Background(), 20, rng, start=293.15, stop=333.15)
+    names = ("object_temperature", "background_temperature")
+    warm, cold = (flat[name].values.reshape(350, 4, 5) for name in names)
     scene = simulation.scene(time, warm, cold, emissivity)
     response = rig.response()
     return scene, simulation.observe(scene, response, rng), response

@@ -152,9 +152,8 @@ def slow(of: float) -> Callable[[Array, np.random.Generator], Array]:
 def slow_apart(seed: int) -> Scene:
     """Reflections that change over seconds, which the second camera sees by 4 pixels displaced."""
     rng = np.random.default_rng(seed)
-    truth = simulation.walkers(
-        TIME, SHAPE, emissivity_of(0.92, 0.84), rng, temperatures=(295.0, 302.0, 310.0)
-    )
+    warm: Any = {"temperatures": (295.0, 302.0, 310.0)}
+    truth = simulation.walkers(TIME, SHAPE, emissivity_of(0.92, 0.84), rng, **warm)
     wide = gaussian_filter(rng.standard_normal((TIME.size, SHAPE[0], SHAPE[1] + 8)), (6, 5, 5))
     wide = 296.0 + 2.0 * wide / wide.std()
     views = np.stack([wide[:, :, at : at + SHAPE[1]] for at in (0, 4)])

@@ -237,6 +237,7 @@ def test_info_of_stores_and_files(results: Path) -> None:
         cameras = done(results, "info", *names, "--clock", "10", "12")
         assert [*cameras] == ["a.tif", "b.tif"]
         assert cameras["b.tif"]["frame_rate_Hz"] == pytest.approx(12)
+    assert len(done(results, "info", "scene.zarr", "scene.zarr")) == 2  # none is left out
     stages = [it["stage"] for it in done(results, "info", "nuc.zarr", "scene.zarr").values()]
     assert stages == ["correction", "capture"]
 
@@ -570,8 +571,8 @@ ROWS = f"""
 separate scene.zarr response.zarr -o x.zarr -> 'separate --correction' takes raw counts
 separate response.zarr aligned.zarr -o x.zarr -> Exchanged with the response
 separate scene.zarr response.zarr --correction response.zarr -o x.zarr -> calibrate --corr\\S+$
-import other.zarr -o x.zarr -> Invalid 1 files: .* two bands twice, with --variable for each
-import two.npz --bands a b -o x.zarr -> Invalid 1 files: .* twice, with --variable for each
+import other.zarr -o x.zarr -> Invalid 1 files .'other.zarr'.: .* twice, with --variable
+import two.npz --bands a b -o x.zarr -> Invalid 1 files .* twice, with --variable for each
 import two.npz two.npz --bands a b -o x.zarr -> one of the arrays .--variable. .* one of .'a', 'b'.
 separate a.tif response.zarr -o x.zarr -> No dataset 'a.tif'. Must be a zarr folder, as from: dbth
 import response.zarr -o x.zarr -> of stage 'response'. Must be of stage 'capture'
@@ -633,7 +634,12 @@ import scene.zarr --frames 150 300 --every 10 -o x.zarr -> of 'scene.zarr': it h
 {ONE} --offset 0 --every 0 -o x.zarr -> Invalid --every 0
 {ONE} --offset 0 --rows 9 3 -o x.zarr -> Invalid --rows 9 3
 seperate a b -> invalid choice: 'seperate' .choose from .*Did you mean 'separate'
-align corrected.zarr --register none --offset 100 -o x.zarr -> Invalid offset .* it leaves no frame
+align corrected.zarr --register none --offset 12 -o x.zarr -> Invalid --offset .* 80 of 200 frames
+align corrected.zarr --offset 0 --reference 8-15 -o x.zarr -> Unknown --reference '8-15'.* '8-14'
+{SWEEP} --at 5C a5.tif b5.tif -> Repeated --at 278.15K .5C.. Must be stated once
+calibrate --at \N{MINUS SIGN}5C a.tif b.tif -o x.zarr -> Invalid temperature '\N{MINUS SIGN}5C'
+demo dangling -> There is something at 'dangling'
+align corrected.zarr --offset 0 --overwrite -o link.zarr -> a link. Must be 'nowhere.zarr'
 align a.zarr --ofset 0 -o x.zarr -> unrecognized arguments: --ofset 0 Did you mean '--offset'
 align a.zarr --register homograph -o x.zarr -> 'homograph' .*Did you mean 'homography'
 export result.zarr --variable object -o x.tif -> 'object' for .tif.*mean 'object_temperature'
@@ -680,6 +686,8 @@ def mistaken(results: Path) -> Path:
         tifffile.imwrite(results / f"{name}.tif", wrong, photometric="minisblack")
     (results / "noise.tif").write_bytes(bytes(range(50)))
     (results / "folder").mkdir()
+    (results / "dangling").symlink_to("nowhere")
+    (results / "link.zarr").symlink_to("nowhere.zarr")
     np.savez(results / "two.npz", a=stack, b=stack + np.uint16(1))
     zarr.open_group(results / "other.zarr", mode="w").create_array("a", data=stack)
     return results

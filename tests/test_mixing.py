@@ -73,7 +73,6 @@ def test_third_band_helps() -> None:
 @pytest.mark.parametrize("emissivity", [-0.1, 1.2, np.nan])
 def test_bad_emissivity(emissivity: float) -> None:
     """An emissivity outside [0, 1] is named."""
-    with pytest.raises(
-        ValueError, match=re.escape(f"Invalid emissivity {emissivity}. Must lie in")
-    ):
+    rule = re.escape(f"Invalid emissivity {emissivity}. Must lie in")
+    with pytest.raises(ValueError, match=rule):
         mixing.leaving([0.5, emissivity], 1.0, 2.0)

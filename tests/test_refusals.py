@@ -143,6 +143,16 @@ CASES: list[tuple[Call, str]] = [
     (lambda: correction.Reference(CAMERA, PATCH, (22.0,)), r"temperatures \[K\] 22.0.*in kelvin"),
     (lambda: limits.CaptureDesign(level=22.0), "level 22.0.*in kelvin"),
     (lambda: fitted(room_temperature=22.0), "room_temperature of the response 22.0.*in kelvin"),
+    (lambda: fitted(gain_std=2.0), "gain_std of the response 2.0"),
+    (lambda: figures.status(NOTHING), "Invalid result of type NoneType"),
+    (lambda: store.save_figure(NOTHING, "a.png", {}), "Invalid figure of type NoneType"),
+    (lambda: store.provenance(cast(Any, [1])), "Invalid parameters of type list"),
+    (lambda: store.save(CAPTURE, "a.zarr", {"a": np.nan}), "Invalid parameter 'provenance'"),
+    (lambda: paired(NOTHING, STILL), "Invalid recording of band '8-14' of type NoneType"),
+    (
+        lambda: alignment.align(CAPTURE, offset=cast(Any, [0, 1])),
+        "DataArray .band., 0 in the first",
+    ),
     (lambda: limits.plan(TABLE.sel(band=["8-14"]), NOISE), "Missing band '8-14', or a second one"),
     (lambda: simulation.Background(level=22.0), r"level \[K\] 22.0.*in kelvin"),
     (lambda: simulation.Background(drift=np.nan), "drift"),
@@ -239,9 +249,8 @@ def few(part: xr.DataArray) -> xr.DataArray:
 
 def film(emission: xr.DataArray = OBJECT, change: xr.DataArray = CHANGE) -> list[Any]:
     """A film of two frames."""
-    return list(
-        drawings.scenes.separated_film(few(APPARENT), few(emission), few(change), title="a")
-    )
+    parts = (few(APPARENT), few(emission), few(change))
+    return list(drawings.scenes.separated_film(*parts, title="a"))
 
 
 def rows(emission: xr.DataArray = OBJECT, change: xr.DataArray = CHANGE) -> Any:
@@ -367,6 +376,17 @@ def test_times_differ_beyond_rounding(here: Any, there: Any, *, same: bool) -> N
     else:
         with pytest.raises(ValueError, match="Invalid 'time' of "):
             laid_on(second, first, "the second", "the first")
+
+
+def test_a_reference_far_off_is_named() -> None:
+    """A patch that the calibrated cameras read 20 K colder than stated is told, with how much."""
+    black = response.counts(CAMERA, xr.full_like(OBJECT, 300.0)) + RNG.normal(0, 4, COUNTS.shape)
+    raw, patch = CAPTURE.assign(counts=black.round().astype(np.uint16)), PATCH.drop_vars(["y", "x"])
+    right = correction.Reference(CAMERA, patch, (300.0,))
+    assert "warnings" not in correction.correct_capture(raw, PLAIN, reference=right).attrs
+    wrong = correction.Reference(CAMERA, patch, (320.0,))
+    with pytest.warns(UserWarning, match="Patch 0 of 320 K reads about -18 K off in band '"):
+        correction.correct_capture(raw, PLAIN, reference=wrong)
 
 
 def test_shutter_events_of_another_capture_are_refused() -> None:

@@ -43,9 +43,8 @@ def recorded(
     time = np.arange(199 * every + 1 + later) * FRAME / every
     field = None if shift is None else smooth_shift(shape, *shift)
     truth = Picture(shape=shape, walkers=walkers).draw(time, GLASS, rng, field)
-    seen = disturbances.expose(
-        truth, RIG.response(), rng, every=every, offsets=(0, later), frames=200
-    )
+    taken: Any = {"every": every, "offsets": (0, later), "frames": 200}
+    seen = disturbances.expose(truth, RIG.response(), rng, **taken)
     seen = seen if stamped else seen.drop_vars("exposure_time")
     detector = simulation.pattern(RIG, shape, rng)
     movies = simulation.blackbody_movies(RIG, np.linspace(275.0, 345.0, 6), 16, detector, rng)
@@ -58,9 +57,8 @@ def accuracy(result: xr.Dataset, truth: xr.Dataset) -> tuple[float, float, float
     error = result["object_temperature"] - truth["object_temperature"].interp(
         time=result["time"], kwargs={"fill_value": "extrapolate"}
     )
-    inside = (abs(error) < INTERVAL * result["object_temperature_std"]).where(
-        error.notnull() & good
-    )
+    inside = abs(error) < INTERVAL * result["object_temperature_std"]
+    inside = inside.where(error.notnull() & good)
     rms = float((error.where(good) ** 2).mean() ** 0.5)
     return float(good.mean()), rms, float(inside.mean())
 
@@ -145,9 +143,8 @@ def test_a_target_has_the_same_result(tmp_path: Path) -> None:
     store.save(raw, path, {})
     options: dict[str, Any] = {"registration": None, "aligning": {"offset": 0.0}}
     at_once = separate_capture(raw, fitted, response, **options)
-    lazy = separate_capture(
-        store.open_dataset(path), fitted, response, **options, target=tmp_path / "all.zarr"
-    )
+    options["target"] = tmp_path / "all.zarr"
+    lazy = separate_capture(store.open_dataset(path), fitted, response, **options)
     assert "..." in repr(lazy)  # not read
     assert "reflection_shift" in at_once
     good, rms, hold = accuracy(at_once, truth)
@@ -181,9 +178,8 @@ def test_memory_of_long_captures(tmp_path: Path) -> None:
     Of these rows; more of them add some 4 kB a pixel.
     """
     rig: dict[str, Any] = {"shift": (2.4, 1.2), "view": (3, -2), "late": 1, "shutter": (0.4,)}
-    recording = whole.record(
-        (48, 640), (2100, 60.0), 1, **rig, lost=(0.03, 0.005), steps=9, frames=16
-    )
+    options = {**rig, "lost": (0.03, 0.005), "steps": 9, "frames": 16}
+    recording = whole.record((48, 640), (2100, 60.0), 1, **options)
     fitted, response = whole.calibrate(recording.movies)
     store.save(recording.capture, tmp_path / "raw.zarr", {})
     del recording

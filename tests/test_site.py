@@ -86,9 +86,8 @@ def test_formulas_are_drawn() -> None:
     for path in sorted((ROOT / "dbthermal").rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             text = node.value if isinstance(node, ast.Constant) else None
-            for line, block in FORMULA.findall(
-                inspect.cleandoc(text) if isinstance(text, str) else ""
-            ):
+            plain = inspect.cleandoc(text) if isinstance(text, str) else ""
+            for line, block in FORMULA.findall(plain):
                 to_mathml((line or block).strip(), as_block=bool(block))
 
 

@@ -1,7 +1,4 @@
-"""Subcommands of the command line, thin calls of the library, and the line that says their stage.
-
-See `dbthermal.__main__`.
-"""
+"""Subcommands of the command line, and the line that says their stage; see `__main__`."""
 
 import difflib
 import math
@@ -47,12 +44,8 @@ def is_source(name: str, value: Any) -> bool:
 
 def accepted(function: Callable[..., Any], options: Namespace) -> dict[str, Any]:
     """Options that a function takes by name; paths, which are opened first, are not among them."""
-    names = signature(function).parameters
-    return {
-        name: value
-        for name, value in vars(options).items()
-        if name in names and value is not None and not isinstance(value, Path)
-    }
+    names, stated = signature(function).parameters, vars(options).items()
+    return {name: it for name, it in stated if name in names and not isinstance(it, Path | None)}
 
 
 def finite(text: str) -> float:
@@ -81,7 +74,8 @@ def kelvin(text: str) -> float:
 
 def kelvin_or_path(text: str) -> float | Path:
     """Temperature, or the path of a file."""
-    return kelvin(text) if re.fullmatch(r"[-+\d.,]+ ?(deg\w* ?)?\W?[A-Za-z]?", text) else Path(text)
+    form = r"[-+\N{MINUS SIGN}\N{EN DASH}\d.,]+ ?(deg\w* ?)?\W?[A-Za-z]?"
+    return kelvin(text) if re.fullmatch(form, text) else Path(text)
 
 
 def sources_and_targets(options: Namespace) -> tuple[list[Path], list[Path]]:
@@ -99,7 +93,9 @@ def sources_and_targets(options: Namespace) -> tuple[list[Path], list[Path]]:
             label = f"Invalid output '{path}': an input or another output lies there"
             raise ValueError(f"{label}. Must be another place.")
         taken.append(place)
-        if path.exists() and not getattr(options, "overwrite", path.is_dir()):
+        if (path.exists() or path.is_symlink()) and not getattr(
+            options, "overwrite", path.is_dir()
+        ):
             rule = "new, or --overwrite" if "overwrite" in options else "new, or a folder"
             raise FileExistsError(f"There is something at '{path}'. Must be {rule}.")
         if "output" in options and not path.name.endswith(end):
@@ -113,14 +109,10 @@ def plain(value: Any) -> Any:
 
 
 def lines_of(summary: Any, indent: str = "") -> Iterator[str]:
-    """Summary as text: a line for each entry that is not empty, numbers in one line.
-
-    Sentences (`answer`) and commands (`next`) have a line each; `numbers` repeat those of the
-    sentences, for programs.
-    """
+    """Summary as text: a line for each entry that is not empty, sentence or command."""
     for key, value in summary.items():
         if key in {"answer", "next", "numbers"}:
-            yield from (f"{indent}{line}" for line in value if key != "numbers")
+            yield from (f"{indent}{it}" for it in value if key != "numbers")  # for programs
             continue
         entries = value if isinstance(value, dict) else dict[str, Any]()
         if any(isinstance(entry, dict | list | str) for entry in entries.values()):

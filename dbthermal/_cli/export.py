@@ -50,11 +50,8 @@ def export(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _curves(result: xr.Dataset, path: Path, options: argparse.Namespace) -> dict[str, Any]:
-    """Mean, extremes, deviation, number of pixels and status of each place over time.
-
-    Without a place, of the image; temperatures in degrees Celsius. A single pixel counts with its
-    flags, which a column names; in a region the measured pixels count, which have none.
-    """
+    """Mean, extremes, deviation, number of pixels and status of each place, or image, over time."""
+    # A single pixel counts with its flags, in a region the measured pixels, which have none.
     view, columns = explorer.View(result), dict[str, xr.DataArray]()
     height, width = view.shape
     boxes = [(y, y + 1, x, x + 1) for y, x in options.pixel] + [*map(tuple, options.region)]

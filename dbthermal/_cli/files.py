@@ -165,7 +165,7 @@ def capture(paths: list[Path], options: argparse.Namespace, offset: Any) -> xr.D
         return staged(argparse.Namespace(capture=paths[0]), capture="capture|corrected")[0]
     number, cameras = len(options.bands or "ab"), _cameras(paths, options.bands or "ab")
     if len(cameras) < 2 or paths.count(PLUS) not in {0, len(cameras) - 1}:
-        label = f"Invalid {len(paths)} files: which are of the second camera is not clear"
+        label = f"Invalid {len(paths)} files {[*map(str, paths[:3])]}: of which camera is not clear"
         rule = "a file of two bands twice, with --variable for each"
         raise ValueError(f"{label}. Must be one of each camera, or: a*.tif + b*.tif; {rule}.")
     if options.bands is None:
@@ -191,8 +191,7 @@ def _cameras(paths: list[Path], bands: Sequence[str] = "ab") -> list[list[Path]]
 
 def _room(options: argparse.Namespace) -> Path:
     """Folder for films on disk: beside the output, or that of the system."""
-    output: Path | None = vars(options).get("output")
-    folder = output.absolute().parent if output else Path(gettempdir())
+    folder: Path = (vars(options).get("output") or Path(gettempdir(), "film")).absolute().parent
     return folder if folder.is_dir() else Path(gettempdir())
 
 
@@ -242,7 +241,8 @@ def provenance(options: argparse.Namespace) -> dict[str, Any]:
 def info(options: argparse.Namespace) -> dict[str, Any]:
     """Command `info`."""
     cameras = _cameras(options.files)
-    return {str(paths[0]): _described(paths, options, n) for n, paths in enumerate(cameras)}
+    keys = [f"{it[0]}{f' ({n + 1})' * (cameras.count(it) > 1)}" for n, it in enumerate(cameras)]
+    return {key: _described(cameras[n], options, n) for n, key in enumerate(keys)}
 
 
 def _described(paths: list[Path], options: argparse.Namespace, camera: int) -> dict[str, Any]:

@@ -26,11 +26,13 @@ from dbthermal import (
     store,
 )
 from dbthermal._cli import PLUS, accepted, files, leaves
+from dbthermal._text import check_listed, repeated
 from dbthermal._warnings import warned
 from dbthermal.limits._planner import SKY_LEVEL
 from dbthermal.readers._recording import optional
 from dbthermal.response import ACCURACY
 from dbthermal.separation._doubts import hardly_measured
+from dbthermal.separation._quality import MOST_MISSING
 from dbthermal.separation._run import BASE
 
 _SWEEP = 64  # frames of each temperature of a blackbody that are taken
@@ -55,11 +57,8 @@ _SCENE: Final = (
     "tape, its middle heated from 22 to 60 degC while people walk by"
 )
 
-_OUTPUTS: Final = {
-    "import": "capture",
-    **dict.fromkeys(("correct", "align"), "corrected"),
-    **dict.fromkeys(("separate", "complete"), "separated"),
-}
+_OUTPUTS: Final = {"import": "capture", "correct": "corrected", "align": "corrected"}
+_OUTPUTS.update(separate="separated", complete="separated")
 """Command -> stage of what it writes, whose size follows from that of a capture."""
 
 
@@ -163,6 +162,9 @@ def _blackbody(options: argparse.Namespace) -> xr.Dataset:
         files.check_all(good[frames].size, options, "frames", f"the blackbody at {temperature:g} K")
         movie = still[["counts"]].isel(time=good[frames]).load().drop_vars("time")
         movies.append(movie.rename(time="frame").expand_dims(temperature=[temperature]))
+    if twice := repeated(temperature for temperature, *_ in options.at):
+        rule = "Must be stated once: join its files, or leave some out"
+        raise ValueError(f"Repeated --at {twice[0]}K ({twice[0] - zero_Celsius:g}C). {rule}.")
     # All temperatures have the frames of the shortest recording.
     number = min(movie.sizes["frame"] for movie in movies)
     joined: Any = {"dim": "temperature", "combine_attrs": lambda attrs, **_: schema.origin(*attrs)}
@@ -197,6 +199,8 @@ def align(options: argparse.Namespace) -> dict[str, Any]:
     """Command `align`."""
     (corrected,) = files.staged(options, capture="corrected")
     options.register = options.register or "homography"
+    if options.reference is not None:
+        check_listed("Unknown --reference", options.reference, corrected["band"].values.tolist())
     named = {**_aligning(options, corrected), "clock": options.reference}
     if options.register != "none":
         named["transform"] = alignment.register(corrected, model=options.register)
@@ -211,7 +215,14 @@ def _aligning(options: argparse.Namespace, capture: xr.Dataset) -> dict[str, Any
         if len(named["offset"]) != len(bands):
             rule = f"Must be {len(bands)}, one for each of the bands {bands}"
             raise ValueError(f"Invalid --offset {named['offset']}. {rule}.")
-        named["offset"] = xr.DataArray([0.0, *named["offset"]], {"band": [first, *bands]}, "band")
+        offset = xr.DataArray([0.0, *named["offset"]], {"band": [first, *bands]}, "band")
+        stamps = capture.get("exposure_time", capture["time"]) + offset
+        shared = (stamps >= stamps.min("time").max()) & (stamps <= stamps.max("time").min())
+        common, number = (int(it.sum("time").min()) for it in (shared, stamps.notnull()))
+        if common < MOST_MISSING * number:
+            label = f"{named['offset']}: it leaves {common} of {number} frames that all bands have"
+            raise ValueError(f"Invalid --offset {label}. Must be in seconds, and leave half.")
+        named["offset"] = offset
     return named
 
 
@@ -342,11 +353,9 @@ def _table(
 def data(_: argparse.Namespace) -> dict[str, Any]:
     """Command `data`."""
     table = emissivity.embedded_table()["emissivity"]
+    edges = {name: (1e6 * it.lower, 1e6 * it.upper) for name, it in bands.FILTERS.items()}
     return {
-        "filters_um": {
-            name: [round(1e6 * band.lower, 3), round(1e6 * band.upper, 3)]
-            for name, band in bands.FILTERS.items()
-        },
+        "filters_um": {name: np.round(it, 3).tolist() for name, it in edges.items()},
         "emissivity": table.transpose("band", "material").to_pandas().round(3).to_dict(),
         "outside_files": "listed by data_manifest.yaml of a clone, and fetched there by: make data",
     }

@@ -266,9 +266,9 @@ def _offsets(
     if isinstance(offset, xr.DataArray):
         values = schema.band_values(offset, names, "the time offset", "s")
     else:
-        if len(names) != 2:
-            rule = "Must be one for each, (band)"
-            raise ValueError(f"Invalid offset {offset} s for bands {names}. {rule}.")
+        if len(names) != 2 or np.ndim(offset):
+            rule = "Must be one for each: a number for two, or a DataArray (band), 0 in the first"
+            raise ValueError(f"Invalid offset {offset!r:.60} s for bands {names}. {rule}.")
         values = np.array([0.0, _numbers.real_number("offset [s]", offset)])
     if values[0] != 0 or not np.all(np.isfinite(values)):
         rule = f"Must be finite, and 0 in band '{names[0]}', the first"

@@ -1,13 +1,12 @@
 """Correction of a camera's raw counts: errors of the detector are undone or marked.
 
-Begin with `fit_correction` (gain, offset and bad pixels from a blackbody, whose movies
-`blackbody_statistics` reduces); then `correct_capture` does all of it in one documented order. Its
-steps are functions of their own, for a capture that was corrected in part elsewhere. A sample that
-is no measurement becomes NaN or is flagged, never filled. `alignment.register` and
-`alignment.align` follow, then `separation.solve`.
+Begin with `fit_correction` (gain, offset and bad pixels, from `blackbody_statistics`); then
+`correct_capture` does all else in one order, by steps that are functions, too. A sample that is no
+measurement becomes NaN or is flagged, never filled. `alignment` follows, then `separation`.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -243,8 +242,8 @@ def _events(
     if findings.bad.any():
         # Copies of a bad frame are bad, too.
         last = np.maximum.accumulate(np.where(repeats, 0, np.arange(counts.sizes["time"])), axis=1)
-        bad = np.take_along_axis(findings.bad, last, axis=1)
-        capture = capture.assign(exposure_time=stamps.where(~bad))
+        findings = replace(findings, bad=np.take_along_axis(findings.bad, last, axis=1))
+        capture = capture.assign(exposure_time=stamps.where(~findings.bad))
     capture = capture.assign_attrs(bad_frames=findings.bad.sum(axis=1).tolist())
     events = events_of(counts, repeats, shut | findings.shutter, findings.steps)
     return capture, events, findings.notes(names)

@@ -50,10 +50,7 @@ _STEP: Final = 2.5
 # product of the signs, from which the scene has stepped.
 _AT_ONCE, _ALSO, _BOTH, _SIGNS = 0.7, 0.4, 1.5, 0.15
 _SHOWN: Final = 10  # runs of bad frames that are named
-_BAD: Final = (
-    "{} frames of band '{}' are left out, which neither the frames before nor those after predict: "
-    "{}"
-)
+_BAD: Final = "{} frames of band '{}' are left out, which those before and after do not predict: {}"
 _CHANGED: Final = (
     "The fixed pattern of band '{}' changes at frame {}, as by a shutter event that is not marked: "
     "a new segment begins there"

@@ -160,9 +160,8 @@ def fit_correction(
     _numbers.whole_number("maximum of the detector", maximum, (1, DETECTOR_MAXIMUM))
     image = counts.shape[2:]
     # Fit each band by itself.
-    fits = []
-    for name, band in zip(counts["band"].values, counts.values.astype(np.float64), strict=True):
-        fits.append(_fit_band(band.reshape(len(band), -1), str(name), threshold, maximum))
+    pairs = zip(map(str, counts["band"].values), counts.values.astype(np.float64), strict=True)
+    fits = [_fit_band(it.reshape(len(it), -1), name, threshold, maximum) for name, it in pairs]
     gain, offset, bad, residual, level = (np.stack(values) for values in zip(*fits, strict=True))
     maps = {"gain": gain, "offset": offset, "bad": bad}
     values = {name: values.reshape(-1, *image) for name, values in maps.items()}
@@ -297,12 +296,10 @@ def _pattern_std(correction: xr.Dataset, counts: xr.DataArray, good: Mask) -> xr
     """Deviation (band) [count] of the pattern at the levels of good pixels; NaN of none."""
     names = [str(name) for name in counts["band"].values]
     places = schema.band_positions(correction, names, "the correction")
-    offset, gain, centre = (
-        correction[name].values[places] for name in ("offset_std", "gain_std", "centre")
-    )
+    kinds = ("offset_std", "gain_std", "centre")
+    offset, gain, centre = (correction[name].values[places] for name in kinds)
     step, level = stride(counts.shape[1:], _LEVELS), np.full(len(names), np.nan)
-    sample = counts[:, ::step, ::step, ::step].values.astype(np.float64)
-    sample = sample[:, :, good[::step, ::step]]
+    sample = counts[:, ::step, ::step, ::step].values[:, :, good[::step, ::step]].astype(np.float64)
     if sample.size:
         level = np.square(sample - centre.reshape(-1, 1, 1)).mean(axis=(1, 2))
     std = np.sqrt(offset**2 + gain**2 * level)

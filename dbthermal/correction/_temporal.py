@@ -9,9 +9,11 @@ from dbthermal import _numbers, _rows, _smooth, schema
 from dbthermal import response as responses
 from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
+from dbthermal._warnings import warned
 
 _LONGEST = 1.0  # time constant of a pixel [s]; of microbolometers it is some 10 ms
 _PATCH = schema.Variable(("y", "x"), "bool", "1", "patch of constant temperature")
+_DOUBTED = 5.0  # deviations of a calibration, by default 0.5 K, that no drift explains (20 K: 39)
 
 
 def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.Dataset:
@@ -193,7 +195,7 @@ class Reference:
 def refer(corrected: xr.Dataset, reference: Reference, *, lazy: bool) -> xr.Dataset:
     """Counts (band, time, y, x) with the level, and by several patches the gain, of a reference.
 
-    Attribute ``level_reference`` has what remains unknown, see `response.accuracy`.
+    Attribute ``level_reference``: what remains unknown. A warning names patches far off readings.
     """
     counts, names = corrected["counts"], [str(name) for name in corrected["band"].values]
     masks = _good(reference.patches, corrected, "the patches")
@@ -208,7 +210,8 @@ def refer(corrected: xr.Dataset, reference: Reference, *, lazy: bool) -> xr.Data
         stds.append(pixels.std("pixel", ddof=1).values / np.sqrt(rows.size))
     # Line from the measured to the expected counts of each band.
     temperatures = np.asarray(reference.temperatures, dtype=np.float64)
-    remaining, lines = {}, np.empty((2, len(names), 1, 1, 1))
+    remaining, lines, notes = {}, np.empty((2, len(names), 1, 1, 1)), list[str]()
+    stated, std = responses.accuracy(reference.response, names), reference.temperature_std
     for band, curve in enumerate(responses.curves(reference.response, names)):
         seen = np.array([mean[band] for mean in means])
         wanted = curve.counts(temperatures)
@@ -219,9 +222,13 @@ def refer(corrected: xr.Dataset, reference: Reference, *, lazy: bool) -> xr.Data
         if len(errors) > 1:
             scatter = np.sum((temperatures - temperatures.mean()) ** 2)
             remaining[names[band]]["gain_std"] = float(np.sqrt(np.mean(errors**2) / scatter))
-
+        # Patches that contradict the calibration.
+        off = (seen - wanted) / curve.count_slope(temperatures)
+        times = np.abs(off) / np.hypot(stated.reading(band, temperatures), std)
+        for patch in np.flatnonzero(times > _DOUBTED):
+            label = f"Patch {patch} of {temperatures[patch]:.6g} K reads about {off[patch]:+.2g} K"
+            label += f" off in band '{names[band]}', {times[patch]:.0f} deviations of its response"
+            notes.append(f"{label}. Must be black, and right: all levels follow it.")
     result = _rows.changed(counts, lambda values: lines[0] * values + lines[1], lazy=lazy)
-    level = {"temperature": float(temperatures.mean()), "std": reference.temperature_std}
-    return corrected.assign(counts=result).assign_attrs(
-        level_reference={**level, "bands": remaining}
-    )
+    level = {"temperature": float(temperatures.mean()), "std": std, "bands": remaining}
+    return warned(corrected.assign(counts=result).assign_attrs(level_reference=level), *notes)

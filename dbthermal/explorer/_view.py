@@ -190,10 +190,10 @@ class View:
         """
         if name == "status":
             raise ValueError("Invalid pane 'status'. Must be one with numbers.")
+        schema.require(region, Region, "region")
         if not (mask := region.mask(self.shape)).any():
             raise ValueError(f"Invalid {region}: no pixel of the {self.shape} is inside it.")
-        # Read the box around the region, some frames in one pass.
-        box = tuple(slice(places.min(), places.max() + 1) for places in np.nonzero(mask))
+        box = tuple(slice(places.min(), places.max() + 1) for places in np.nonzero(mask))  # of it
         pane, where = self.pane(name, *box), (mask & self.counted(pixels))[box]
         gain, base = self._common(pane, box, where), name.removesuffix("_std")
         contrast = [] if gain is None else [self.pane(film, *box) for film in FILMS]

@@ -127,8 +127,8 @@ def status(result: xr.Dataset) -> Figure:
     >>> [text.get_text() for text in figure.axes[1].get_legend().get_texts()]
     ['75.0 %  no flag', '25.0 %  dead pixel']
     """
-    # Colour of each pixel's first flag.
-    codes, shown = legend(result["status"])
+    schema.require(result, xr.Dataset, "result")
+    codes, shown = legend(result["status"])  # the first flag of each pixel
     image = np.array([to_rgb(color) for _, color, _ in shown])[codes]
     height = 5.2 * codes.shape[0] / codes.shape[1]
     figure, axes = canvas(1, 2, (9.6, max(height, 0.25 * len(shown)) + 0.6))

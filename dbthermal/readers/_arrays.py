@@ -19,6 +19,7 @@ _WITHOUT_NAME: Final = r"||None|(phony_)?dim_\d+"
 _NEUTRAL: Final = {"scale_factor": 1, "scale": 1, "slope": 1, "add_offset": 0, "intercept": 0}
 _ATTRIBUTES: Final = (
     *("units", "unit", *_NEUTRAL, "_FillValue", "missing_value", "origin", "_Unsigned"),
+    *("long_name", "standard_name"),
 )
 
 
@@ -76,11 +77,11 @@ def array(
             values, lines = _containers.opened(path, name, stack)
         else:
             coords = source.coords.values() if isinstance(source, xr.DataArray) else ()
-            lines = [axis for axis in coords if _containers.are_times(axis.name, axis)][:1]
+            lines = dict([(c.name, c) for c in coords if _containers.are_times(c.name, c)][:1])
         attributes = _checked(values, label, unit)
         _recording.check_memory(getattr(values, "shape", ()), memory, label, stored)
-        for times in lines:
-            seconds = _seconds(times, values.shape[0], clock, label, path)
+        for line in lines.items():
+            seconds = _seconds(line, values.shape[0], clock, label, path)
             clock = seconds if clock is None else clock
         if clock is None:
             _recording.stamps(clock, 0, label)  # refuses it
@@ -115,13 +116,19 @@ def _checked(values: Any, label: str, unit: str) -> dict[str, Any]:
     if dtype.itemsize != 2 or dtype.kind not in ("iu" if unsigned else "u"):
         rule = "Must be uint16 (in NetCDF 3 short, _Unsigned='true'): counts; convert whole numbers"
         raise ValueError(f"Invalid dtype {dtype} of '{label}'. {rule}.")
+    name = "" if hasattr(values, "stream") else str(getattr(values, "name", ""))  # not of a file
+    titles = f"{name.rpartition('/')[2]} {texts['long_name']} {texts['standard_name']}"
+    if named := re.search("temperature|celsius|kelvin", titles, re.IGNORECASE):
+        rule = "Must be counts: rename the array if it is of counts"
+        raise ValueError(f"Invalid array of '{label}', named '{named.group()}'. {rule}.")
     text = str(attributes.get("units", attributes.get("unit", unit))).strip()
     _recording.check_unit(unit if text in {"", "1"} else text, label)
     return attributes
 
 
-def _seconds(times: Any, frames: int, clock: Clock | None, label: str, path: Path) -> Clock | None:
-    """Seconds by an array of times, which the clock must not contradict; the clock for a text."""
+def _seconds(line: Any, frames: int, clock: Clock | None, label: str, path: Path) -> Clock | None:
+    """Seconds by named times, which the clock must not contradict; the clock for a text."""
+    name, times = line
     if times.size != frames:
         rule = f"Must be {frames}, one for each frame"
         raise ValueError(f"Invalid number {times.size} of times of '{label}'. {rule}.")
@@ -129,4 +136,5 @@ def _seconds(times: Any, frames: int, clock: Clock | None, label: str, path: Pat
     if (moments := _containers.moments(times)) is None:
         return clock
     unit = "s" if times.dtype.kind in "OSU" else _containers.attribute(times, "units")
-    return _recording.check_times(moments, str(unit or ""), clock, label)
+    unit = unit or (re.search("_(s|ms|us|ns)$", str(name).lower()) or ("", ""))[1]  # by its name
+    return _recording.check_times(moments, str(unit), clock, label)

@@ -23,9 +23,9 @@ import zarr
 from dbthermal import _text as texts
 from dbthermal.readers import _formats, _recording, _variables
 
-# Names of times: of a dim, and of an array beside another.
-_BESIDE: Final = re.compile("(frame_?)?time(s|_?stamps?|_s)?", re.IGNORECASE)
-_TIMES: Final = re.compile(f"t|{_BESIDE.pattern}", re.IGNORECASE)
+# Names of times, perhaps with their unit: of a dim, and of an array beside another.
+_BESIDE: Final = re.compile("(?i)((frame_?)?time(s|_?stamps?)?|t(?=_))(_(s|ms|us|ns))?")
+_TIMES: Final = re.compile(f"{_BESIDE.pattern}|t")
 _MOMENT: Final = 40  # longest text of a moment [character]
 _OBJECTS, _DEPTH = 4096, 32  # of a file of HDF5; one with more takes minutes to list
 _LONGEST: Final = 2**10  # of a time [byte]; longer text, as a table in each place, is none
@@ -86,22 +86,22 @@ def moments(times: Any) -> npt.NDArray[Any] | None:
     return np.array(seconds) if seconds else None
 
 
-def _times_of(arrays: dict[str, Any], name: str, frames: int) -> list[Any]:
+def _times_of(arrays: dict[str, Any], name: str, frames: int) -> dict[str, Any]:
     """Times of an array of a file: of its first dim, or by their names, of many films beside it."""
     group, dims = name.rpartition("/")[0], dims_of(arrays[name])[:1]
     lines = {key.rpartition("/")[::2]: array for key, array in arrays.items() if array.ndim < 3}
     if dims and (group, dims[0]) in lines:
-        return [lines[group, dims[0]]]
+        return {dims[0]: lines[group, dims[0]]}
     films = sum(array.ndim == 3 for array in arrays.values())
-    return [
-        array
+    return {
+        key: array
         for (place, key), array in lines.items()
         if _BESIDE.fullmatch(key) and array.size == frames and (place == group or films == 1)
-    ]
+    }
 
 
-def opened(path: Path, name: str | None, stack: ExitStack) -> tuple[Any, list[Any]]:
-    """Array of three dimensions of a file, by its name if there are several, and its times.
+def opened(path: Path, name: str | None, stack: ExitStack) -> tuple[Any, dict[str, Any]]:
+    """Array of three dimensions of a file, by its name if there are several; its times by name.
 
     What the libraries raise until the file is closed names it as damaged.
     """

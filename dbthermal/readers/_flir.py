@@ -147,8 +147,7 @@ def flir(
                 unlike = f"{image.shape}, {image.codec} of {place}"
                 raise ValueError(f"Invalid image {unlike}. Must be {form.shape}, {form.codec}.")
             if image.codec == "none":
-                values = np.frombuffer(image.body, f"{image.order}u2")
-                counts[number] = values.reshape(image.shape)
+                counts[number] = np.frombuffer(image.body, f"{image.order}u2").reshape(form.shape)
             elif image.codec == "png":
                 counts[number] = _recording.png(image.body, place)
             else:
@@ -177,9 +176,8 @@ _Found = tuple[Content, Frame, str]
 def _walk(paths: Sequence[Path], memory: float, stack: ExitStack) -> Iterator[_Found]:
     """Yield content, records and name of each frame of some files."""
     for path in paths:
-        content: Content = stack.enter_context(
-            mmap(stack.enter_context(path.open("rb")).fileno(), 0, access=ACCESS_READ)
-        )
+        file = stack.enter_context(path.open("rb"))
+        content: Content = stack.enter_context(mmap(file.fileno(), 0, access=ACCESS_READ))
         if still := content[:2] == b"\xff\xd8":
             texts.regular_file(path, int(memory))
             content = _flir_records.of_jpeg(content, path.name)

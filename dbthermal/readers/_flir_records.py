@@ -91,12 +91,8 @@ def segments(content: Content, name: str) -> Iterator[tuple[int, int, int]]:
 
 def of_jpeg(content: Content, name: str) -> bytes:
     """Container that the APP1 segments of a radiometric JPEG hold, joined."""
-    payloads = [
-        content[start:stop]
-        for marker, start, stop in segments(content, name)
-        if marker == 0xE1 and content[start : start + len(_SEGMENT)] == _SEGMENT
-    ]
-    if not payloads:
+    bodies = [content[at:stop] for marker, at, stop in segments(content, name) if marker == 0xE1]
+    if not (payloads := [body for body in bodies if body.startswith(_SEGMENT)]):
         label = f"'{name}', an ordinary JPEG or one of another maker"
         rule = "Must be a radiometric JPEG; else export 16-bit counts as TIFF and use readers.tiff"
         raise ValueError(f"No thermal data of FLIR in {label}. {rule}.")

@@ -37,7 +37,7 @@ DAMAGE: Final = (
     *(lzma.LZMAError, struct.error, zipfile.BadZipFile, zlib.error),
 )
 # Factor by which an image is smoother than with bytes swapped or rows cut elsewhere, or unclear.
-_SMOOTHER: Final = 2.0
+SMOOTHER: Final = 2.0
 _ALONG: Final = 64  # samples along each axis that tell which of them is time
 _APART: Final = 1.3  # axes whose roughness differs by this factor are of another kind
 # Most bytes of counts in a byte of a file: the .csq at hand has 11, its counts in a packed TIFF 3.
@@ -167,26 +167,22 @@ def film(values: Any) -> Counts:
 def smoother(images: Iterable[Any], rearranged: Callable[[Any], Any] = np.ndarray.byteswap) -> int:
     """Form in which the first clear image is smoother: 1 as it is, -1 the other, 0 unclear."""
     for frame in images:
-        as_is, swapped = _roughness(frame), _roughness(rearranged(frame))
-        if sign := int(_SMOOTHER * as_is < swapped) - int(_SMOOTHER * swapped < as_is):
+        forms = (frame.astype(np.int32), rearranged(frame).astype(np.int32))
+        as_is, swapped = (sum(np.abs(np.diff(it, axis=n)).sum() for n in (0, 1)) for it in forms)
+        if sign := int(SMOOTHER * as_is < swapped) - int(SMOOTHER * swapped < as_is):
             return sign
     return 0
-
-
-def _roughness(frame: npt.NDArray[Any]) -> float:
-    values = frame.astype(np.int32)
-    return sum(float(np.abs(np.diff(values, axis=axis)).sum()) for axis in (0, 1))
 
 
 def array_name(names: Collection[str], name: str | None, path: Path, shapes: Sequence[str]) -> str:
     """Name of an array in a file, which may be left out if there is one alone."""
     if name is None and len(names) == 1:
         return next(iter(names))
-    if name in [*names]:
-        return str(name)
+    for candidate in (str(name), str(name).strip("/")):
+        if candidate in names:
+            return candidate
     if not names:
-        rule = "Must have one: stack images, squeeze axes of length 1, save each band by itself; "
-        rule += "a store of dbthermal is a capture as it is"
+        rule = "Must have one: stack images, squeeze axes, save each band; a store is a capture"
         label = f"'{path.name}', which has {', '.join(shapes[:3]) or 'none'}"
         raise ValueError(f"Missing array (time, y, x) in {label}. {rule}.")
     wanted = "name of one of the arrays (--variable)" if name is None else f"array '{name}'"
@@ -337,7 +333,7 @@ def _time_elsewhere(counts: Counts, name: str) -> list[str]:
         rough.append(float(np.log(bends[: 3 * bends.size // 4].mean() + 0.3)))
     for axis, like in ((1, 2), (2, 1)):
         alike, unlike = abs(rough[0] - rough[like]), np.abs(np.subtract(rough, rough[axis]))
-        if max(_SMOOTHER * alike, np.log(_APART)) < np.delete(unlike, axis).min():
+        if max(SMOOTHER * alike, np.log(_APART)) < np.delete(unlike, axis).min():
             rule = "Must be (time, y, x): transpose it if it is not"
             return [f"Axis {axis} of '{name}' may be time, by how its neighbours differ. {rule}."]
     return []

@@ -12,7 +12,7 @@ import xarray as xr
 from dbthermal import _numbers
 from dbthermal._arrays import Array
 from dbthermal.readers import _formats, _recording
-from dbthermal.readers._recording import MEMORY, Clock, Counts
+from dbthermal.readers._recording import MEMORY, SMOOTHER, Clock, Counts
 
 _FIRST: Final = 8  # frames that tell rows from columns
 _LONGER: Final = 64  # factor of roughness between the parts of a longer number
@@ -49,10 +49,8 @@ def raw(
     ----------
     path, shape : str or Path, (int, int)
         Regular file; rows and columns of a frame [pixel].
-    byte_order : {"little", "big"}
+    byte_order, unit, clock, memory : {"little", "big"}, and as for `tiff`
         Order of the bytes of a number.
-    unit, clock, memory
-        As for `tiff`.
     header, frame_header : int
         Size of what precedes the first frame, and each frame [byte].
 
@@ -95,14 +93,28 @@ def raw(
         rule = "Must be rows, then columns"
         raise ValueError(f"Invalid shape {shape} of '{name}': rougher than {shape[::-1]}. {rule}.")
     decided = {"byte_order": byte_order, "byte_order_by": "caller"}
-    return _recording.clocked(counts, clock, name, format="raw", **decided)
+    return _recording.clocked(counts, clock, name, *_other_height(counts), format="raw", **decided)
+
+
+def _other_height(counts: Counts) -> list[str]:
+    """Sentence on images that are parts of a frame, or several: rows repeat at another distance."""
+    height, rows = counts.shape[1], np.concatenate(counts[: 2 * _FIRST]).astype(np.int32)
+
+    def change(distance: int) -> float:
+        """Usual change from a row to that so far below."""
+        return float(np.median(np.abs(rows[distance:] - rows[:-distance])) + 0.5)
+
+    tried = [height // n for n in (4, 3, 2) if height % n == 0] + [n * height for n in range(1, 5)]
+    for n in (n for n in tried if 1 < n < len(rows) // 2):
+        aside = -(-n // 8)
+        if change(n) < min(change(n - aside), change(n + aside)) / SMOOTHER:
+            said = f"Rows of images repeat after {n}, not {height}. Must be the height of a frame."
+            return [said] * (n != height)
+    return []
 
 
 def _are_longer(counts: Counts) -> bool:
-    """Tell whether numbers of 16 bits are parts of longer ones, whole or floating-point.
-
-    Then neighbours, or every fourth number, are much rougher than the smoothest of the four.
-    """
+    """Tell whether numbers are parts of longer ones: neighbours, or every fourth, are rougher."""
     values = counts[0].ravel().astype(np.int32)
     if values.size < _FIRST * 4:
         return False
@@ -119,10 +131,8 @@ def sequence(path: str | Path, *, clock: Clock | None = None, memory: float = ME
 
     Parameters
     ----------
-    path : str or Path
+    path, clock, memory : str or Path, and as for `array`
         File; the .inc of an .sfmov lies beside it.
-    clock, memory
-        As for `array`.
     """
     _numbers.real_number("memory", memory, _numbers.POSITIVE)
     (path,) = _formats.files([path], "sequence")

@@ -1,8 +1,7 @@
 """Reader of spectra, of the ECOSTRESS library.
 
 Attributes say what the library says of the sample (`NOTES`, empty where it is silent). Values
-outside [0, 1] come from the calibration of the library's spectrometers and are kept as they are.
-Those outside `schema.EMISSIVITY_LIMITS` have a wrong unit, or are damaged, and are refused.
+outside [0, 1], of the calibration of its spectrometers, are kept within `schema.EMISSIVITY_LIMITS`.
 """
 
 import re
@@ -120,11 +119,9 @@ def spectrum(
 ) -> xr.Dataset:
     """Dataset of a spectrum given over increasing or decreasing wavelength [micrometre]."""
     # Values in range, over wavelengths in order.
-    name, (low, high) = f"'{notes['name']}' of '{file.name}'", schema.EMISSIVITY_LIMITS
-    for quantity, values, lowest, highest in (
-        ("wavelength", wavelength, 1e-3, 1e3),
-        ("emissivity", emissivity, low, high),
-    ):
+    name, limits = f"'{notes['name']}' of '{file.name}'", (1e-3, 1e3, *schema.EMISSIVITY_LIMITS)
+    quantities = [("wavelength", wavelength, *limits[:2]), ("emissivity", emissivity, *limits[2:])]
+    for quantity, values, lowest, highest in quantities:
         for i in np.flatnonzero(~((values >= lowest) & (values <= highest))):
             message = f"Invalid {quantity} {values[i]:g} in {name}"
             raise ValueError(f"{file.at(i)}: {message}. Must lie in [{lowest}, {highest}].")
@@ -136,8 +133,8 @@ def spectrum(
     # Spectrum over rising wavelengths.
     if falling:
         wavelength, emissivity = wavelength[::-1], emissivity[::-1]
-    unphysical = int(np.sum((emissivity < 0) | (emissivity > 1)))
-    attrs = {**dict.fromkeys(NOTES, ""), **notes, "source": file.name}
+    attrs: dict[str, Any] = {**dict.fromkeys(NOTES, ""), **notes, "source": file.name}
+    attrs["unphysical_values"] = int(np.sum((emissivity < 0) | (emissivity > 1)))
     axes = {"wavelength": ("wavelength", wavelength * 1e-6, schema.COORDINATES["wavelength"].attrs)}
     variables = schema.variables("spectrum", {"emissivity": emissivity})
-    return xr.Dataset(variables, axes, {**attrs, "unphysical_values": unphysical})
+    return xr.Dataset(variables, axes, attrs)

@@ -47,9 +47,7 @@ _TEMPERATURES: Final = re.compile(
 _IMAGEJ: Final = re.compile(r"\AImageJ=.*?^images=([0-9]{1,9})$", re.DOTALL | re.MULTILINE)
 
 # Numbers of images along axes, as ImageJ and OME write them.
-_AXES: Final = re.compile(
-    r"""(?:^(channels|slices|frames)=|\bSize([CZT])=")([0-9]{1,9})""", re.MULTILINE
-)
+_AXES: Final = re.compile(r"""(?m)(?:^(channels|slices|frames)=|\bSize([CZT])=")([0-9]{1,9})""")
 # Intervals of frames, their unit, frame rates, and times, as ImageJ, OME and JSON write them.
 _STATED: Final = r"""(?i)\b(?:{})["']?\s*[:=]\s*["']?({})"""
 _NUMBER: Final = r"[0-9]+\.?[0-9]*(?:e[+-]?[0-9]+)?"

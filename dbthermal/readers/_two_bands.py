@@ -86,10 +86,9 @@ def two_bands(
     overlap = min(np.add(stops, shifts)) - max(np.add(starts, shifts))
     lengths = [recording.sizes["time"] for recording in cameras]
     if not overlap > 0 and max(lengths) > 1:
-        label = f"{' and '.join(f'{shift:g}' for shift in shifts[1:])} s: the recordings of "
-        label += " and ".join(f"{stop:g}" for stop in stops)
-        rule = "Must overlap; give offset= if a camera's clock is wrong"
-        raise ValueError(f"Invalid offset {label} s do not overlap. {rule}.")
+        later, spans = (" and ".join(f"{it:g}" for it in each) for each in (shifts[1:], stops))
+        label = f"Invalid offset {later} s: the recordings of {spans} s do not overlap"
+        raise ValueError(f"{label}. Must overlap; give offset= if a camera's clock is wrong.")
     # As many cameras, not a file named twice.
     overlapping = [recording["counts"].values[: min(lengths)] for recording in cameras]
     for film, other_film in combinations(overlapping, 2):
@@ -134,11 +133,12 @@ def _offsets(cameras: Sequence[xr.Dataset], offset: Any) -> list[float]:
             raise ValueError(f"Unknown dates of the recordings. {rule}; 0.0 if together.")
         begun, *later = (datetime.fromisoformat(str(date)) for date in dates)
         return [(date - begun).total_seconds() for date in later]
-    offsets = list(offset) if isinstance(offset, list | tuple) else [offset]
+    offsets = [*offset] if np.ndim(offset) else [offset]
     for value in offsets:
         _numbers.real_number("offset [s]", value, _numbers.FINITE)
     if len(offsets) != len(cameras) - 1:
-        raise ValueError(f"Invalid offset {offset} s. Must be one for each later recording.")
+        label = f"Invalid offset {[float(value) for value in offsets]} s"
+        raise ValueError(f"{label}. Must be one for each later recording.")
     return offsets
 
 
@@ -178,6 +178,7 @@ def _temperatures(films: list[npt.NDArray[np.uint16]]) -> list[str]:
 
 def _check(recording: xr.Dataset, name: str) -> None:
     """Refuse what is no recording of counts in one band: variables, dims, types, rising times."""
+    schema.require(recording, xr.Dataset, f"recording of band '{name}'")
     over_time = dict.fromkeys(("time", "exposure_time", "frame_flags"), ("time",))
     for variable, dims in {"counts": ("time", "y", "x"), **over_time}.items():
         if variable not in recording or recording[variable].dims != dims:

@@ -211,7 +211,7 @@ def netcdf_arrays(path: Path) -> dict[str, xr.Variable]:
     # Size of a variable or its slab, and of a record; a single slab is not filled up.
     sizes = {name: math.prod(shape) * dtype.itemsize for name, (*_, shape, dtype) in forms.items()}
     recorded = [name for name, (dims, _, _, shape, _) in forms.items() if len(dims) > len(shape)]
-    record = sum(_filled(sizes[name]) for name in recorded)
+    record = sum(-(-sizes[name] // 4) * 4 for name in recorded)  # each filled up
     record = sizes[recorded[0]] if len(recorded) == 1 else record
     records = header.records
     if records == 256**header.width - 1:  # written as a stream
@@ -233,11 +233,6 @@ def netcdf_arrays(path: Path) -> dict[str, xr.Variable]:
         values = np.ndarray([*first, *shape], dtype, content.data, start, strides)
         listed[name] = xr.Variable(dims, values, attrs)
     return listed
-
-
-def _filled(size: int) -> int:
-    """Size with what fills it up to a multiple of 4 bytes."""
-    return -(-size // 4) * 4
 
 
 _Form = tuple[list[str], dict[str, Any], int, list[int], np.dtype[Any]]
@@ -294,7 +289,7 @@ class _Header:
 
     def taken(self, size: int) -> bytes:
         """Next bytes, with what fills them up."""
-        start, self.at = self.at, self.at + _filled(size)
+        start, self.at = self.at, self.at + -(-size // 4) * 4
         if self.at > len(self.content):
             raise ValueError(f"Header up to byte {self.at}. Must end within {len(self.content)}.")
         return self.content[start : start + size]

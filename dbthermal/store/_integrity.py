@@ -7,8 +7,7 @@ line for each state until the recording is closed. A file that is damaged, cut, 
 in another's place is then seen: metadata and names when the store is opened, values when read.
 
 The codec crc32c of zarr sees every damaged chunk, but not flipped bits of metadata, exchanged
-chunks, edited attributes, arrays that were lost or renamed, and foreign files; nor, in a recording
-that was cut short, a missing chunk. This list refused each of them.
+chunks, edited attributes, lost or renamed arrays, foreign files, or chunks missing in a recording.
 """
 
 import asyncio
@@ -66,8 +65,7 @@ class CheckedStore(SummedStore):
     def __init__(self, root: Path | str, *, read_only: bool = True) -> None:  # noqa: ARG002 - zarr's
         super().__init__(root, read_only=True)
         deque(texts.tree_files(self.root), maxlen=0)  # nothing is opened that is no file in it
-        # Before the checksums, for a recording that grows may replace it with the next line; and
-        # again if they have changed: it was closed just then.
+        # Before the checksums, which may grow, and again if they have: it was closed just then.
         self.closed, content = False, self._content(GROUP)
         self._sums = dict.fromkeys(_read_sums(self.root))
         if not _is_listed(self._sums, GROUP, content):
@@ -123,10 +121,9 @@ class CheckedStore(SummedStore):
     def _check_files(self, group: tuple[str, str]) -> None:
         """ValueError if a file is missing, or foreign to a store that grows no more."""
         files, listed = files_of(self.root), {key for key, _ in self._sums}
-        wanted = listed
         # Of a store that grows, all files were on the disk whose lines precede that of its group.
-        if not self.closed:
-            wanted = {key for key, _ in takewhile(lambda line: line != group, self._sums)}
+        lines = self._sums if self.closed else takewhile(lambda line: line != group, self._sums)
+        wanted = {key for key, _ in lines}
         if missing := sorted(wanted - files):
             raise ValueError(f"Missing {self._named(missing[0])}. {AS_WRITTEN}")
         # A kill, or a system's file browser, may leave hidden files.

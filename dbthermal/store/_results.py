@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from dbthermal import __version__, _numbers, _text
+from dbthermal import __version__, _numbers, _text, schema
 from dbthermal.store._whole import whole
 
 if TYPE_CHECKING:
@@ -60,6 +60,7 @@ def provenance(
     >>> store.provenance({"frames": 350})["parameters"]
     {'frames': 350}
     """
+    schema.require(parameters, Mapping, "parameters")
     return {
         "parameters": {name: _plain(name, value) for name, value in parameters.items()},
         "versions": {
@@ -160,8 +161,9 @@ def save_figure(
     ...     Image.open(f"{folder}/wall.png").text["Comment"]
     '{"commit": "unknown"}'
     """
-    from matplotlib import rc_context  # noqa: PLC0415 - loaded with the figure
+    import matplotlib.figure  # noqa: PLC0415 - loaded with the figure
 
+    schema.require(figure, matplotlib.figure.Figure, "figure")
     text, suffix = as_json(provenance), _text.as_path(path).suffix
     metadata: dict[str, dict[str, Any]] = {
         ".pdf": {"Creator": "dbthermal", "Subject": text, "CreationDate": None},
@@ -170,7 +172,7 @@ def save_figure(
     }
     kind = suffix if suffix in metadata else ".png"
     fonts: Any = {"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "dbthermal"}
-    with rc_context(fonts), whole(path, kind) as draft:
+    with matplotlib.rc_context(fonts), whole(path, kind) as draft:
         figure.savefig(draft, dpi=dpi, metadata=metadata[kind])
 
 
@@ -224,4 +226,4 @@ def save_video(
 
 
 def as_json(content: Mapping[str, Any], indent: int | None = None) -> str:
-    return json.dumps(content, allow_nan=False, ensure_ascii=True, indent=indent, sort_keys=True)
+    return json.dumps(_plain("provenance", content), indent=indent, sort_keys=True)

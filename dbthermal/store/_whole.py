@@ -1,9 +1,8 @@
 """Files and folders that appear whole under their names, and belong to one process meanwhile.
 
 What is written lies in a hidden folder beside its place until it is whole and on the disk; then it
-is renamed. Signals that end the program are raised as errors, so that it is ended first. After a
-power loss a renamed file may have its new name and no content: so the content is synced first, then
-it is renamed, then the folder that holds the name is synced.
+is renamed. Signals that end the program are raised as errors, so that it is ended first. The
+content is synced before the rename, the folder after it: a power loss leaves no name without it.
 """
 
 import errno
@@ -49,7 +48,9 @@ def check_place(path: str | Path, suffix: str) -> Path:
     """Refuse the path of a file or folder of another end than this, or inside a store."""
     path = texts.as_path(path)
     if path.suffix != suffix:
-        raise ValueError(f"Invalid path '{path}'. Must end in '{suffix}'.")
+        raise ValueError(f"Invalid path '{path}'. Must end in '{suffix}', after a name.")
+    if path.is_symlink():  # which would be replaced, and not what it leads to
+        raise ValueError(f"Invalid path '{path}', a link. Must be '{path.readlink()}' itself.")
     foreign = path.is_dir() and not (path / SUMS).is_file() and any(path.iterdir())
     if foreign or (suffix == ".zarr" and path.is_file()):
         rule = "Must be a store of dbthermal, an empty folder, or none: delete what is not needed"

@@ -24,9 +24,8 @@ def main() -> int:
         print(only(name, int(seed)))
         return 0
     found = {}
-    for one, verdicts in attack_all(
-        [n for n in CLASSES if n in (name or n)], options.inputs, options.seed
-    ):
+    chosen = [it for it in CLASSES if it in (name or it)]
+    for one, verdicts in attack_all(chosen, options.inputs, options.seed):
         found[one] = verdicts
         print(
             *bad(one, options.seed, verdicts),

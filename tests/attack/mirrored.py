@@ -83,9 +83,8 @@ def shifts(rng: Rng) -> Attack:
     names = ("shift|axis|known|band|pixel|reflection_shift|dims|coordinate|'x'",)
     limit = "a wrong shift is not seen everywhere" if what in ("a step", "turned round") else ""
     good, more = what == "nothing" and method == "subspace", {"reflection_shift": spoilt}
-    return replace(
-        solving(f"shift {what}", made, response, method, *names, good=good, **more), limit=limit
-    )
+    attack = solving(f"shift {what}", made, response, method, *names, good=good, **more)
+    return replace(attack, limit=limit)
 
 
 @cache

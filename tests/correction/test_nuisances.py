@@ -364,9 +364,8 @@ def recorded(seed: int, noise: float = 3.4) -> tuple[Floats, xr.Dataset]:
     rng, time = np.random.default_rng(seed), np.arange(FRAMES) / 10.0
     gain = 1.0 + 0.02 * rng.standard_normal((2, *SHAPE))
     offset = 40.0 * rng.standard_normal((2, *SHAPE))
-    wall = (
-        300.0 * (1.0 - np.exp(-time / 8.0))[:, None, None] * np.linspace(1, 1.5, SHAPE[0])[:, None]
-    )
+    rise, share = 300.0 * (1.0 - np.exp(-time / 8.0)), np.linspace(1.0, 1.5, SHAPE[0])
+    wall = rise[:, None, None] * share[:, None]
     mirrored = np.zeros((FRAMES, *SHAPE))
     for start in rng.integers(0, FRAMES - 20, 6):
         column = rng.integers(0, SHAPE[1] - 8)

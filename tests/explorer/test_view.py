@@ -36,9 +36,7 @@ def separated(**changes: Any) -> xr.Dataset:
         "emissivity_std": 1e-3 * flat[:2],
         "status": np.zeros((4, 5), np.uint32),
     } | changes
-    arrays = {
-        name: (variables[name].dims, it, variables[name].attrs) for name, it in values.items()
-    }
+    arrays = {key: (variables[key].dims, it, variables[key].attrs) for key, it in values.items()}
     return xr.Dataset(arrays, {"time": [0.0, 0.5, 1.0], "band": ["8-14", "9.5"]})
 
 
@@ -292,6 +290,7 @@ test_bad_data_and_questions_are_refused = refused(
         (lambda view: view.frame("object_temperature", 3), "Invalid frame 3"),
         (lambda view: view.curve("object_temperature", NOWHERE), "no pixel of the"),
         (lambda view: view.curve("status", WHOLE), "Invalid pane 'status'"),
+        (lambda view: view.curve("object_temperature", (1, 2)), "Invalid region of type tuple"),
         (lambda view: view.counted("some"), "Unknown pixels 'some'"),
         (lambda _: View(separated(), still()), "Invalid size 60 of 'time' of the capture"),
         (lambda _: View(separated(), events={"lamp": np.nan}), "of the event 'lamp'"),

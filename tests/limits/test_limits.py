@@ -77,9 +77,8 @@ def test_known_emissivities_give_the_closed_form() -> None:
     names = ("object_temperature", "background_temperature")
     temperatures = np.stack([scene[name] for name in names])
     shares = np.array([[0.86, 0.14], [0.72, 0.28]])[..., None, None, None]
-    mixed = np.stack(
-        [share * curve.slope(temperatures) for share, curve in zip(shares, curves, strict=True)]
-    )
+    pairs = zip(shares, curves, strict=True)
+    mixed = np.stack([share * curve.slope(temperatures) for share, curve in pairs])
     noise = responses.noise(RIG.response(), list(RIG.bands))
     std = noise / [curve.reference_slope for curve in curves]
     # var = J^-1 diag(s^2) J^-T of each sample.
@@ -104,10 +103,8 @@ def whole_fisher(scene: xr.Dataset, rig: Rig, functions: np.ndarray) -> dict[str
         own, level, free = unknown[:bands], unknown[bands + order], unknown[bands + order + 1 :]
         x, y = functions @ unknown[bands : bands + order], np.full(len(cold), level)
         y[~rest] = free
-        parts = zip(own, curves, noise, strict=True)
-        return np.concatenate(
-            [mixing.leaving(a, u.signal(x), u.signal(y)) / s for a, u, s in parts]
-        )
+        rows = zip(own, curves, noise, strict=True)
+        return np.concatenate([mixing.leaving(a, u.signal(x), u.signal(y)) / s for a, u, s in rows])
 
     truth = np.concatenate([e, functions.T @ warm, [cold.min()], cold[~rest]])
     steps = np.where(np.arange(truth.size) < bands, 1e-4, 0.02)

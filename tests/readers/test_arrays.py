@@ -53,11 +53,15 @@ def test_times_of_npz_and_arrays_of_other_libraries(tmp_path: Path) -> None:
     assert_allclose(read(tmp_path / "a.npz", clock=None).time, [0.0, 0.1, 0.3])
     with pytest.raises(ValueError, match=r"Invalid times of 'a\.npz'.* Must agree to half a frame"):
         read(tmp_path / "a.npz", clock=30.0)
+    for times in ({"time_ns": [7e9, 7.1e9, 7.3e9]}, {"t_ms": [0, 100, 300]}):  # unit by the name
+        np.savez(tmp_path / "a.npz", frames=scene(), **times)
+        assert_allclose(read(tmp_path / "a.npz", clock=None).time, [0.0, 0.1, 0.3])
     assert_array_equal(read([*scene()]).counts, scene())
+    torch = pytest.importorskip("torch")
     with pytest.raises(ValueError, match=r"Invalid dtype int32 of 'array'"):
-        read(
-            pytest.importorskip("torch").zeros((3, 4, 5), dtype=pytest.importorskip("torch").int32)
-        )
+        read(torch.zeros((3, 4, 5), dtype=torch.int32))
+    with pytest.raises(ValueError, match=r"Invalid array of 'b\.h5', named 'Temperature'.*rename"):
+        read(hdf5(tmp_path / "b.h5", _long_name="Temperature in 0.01 K"))
     with pytest.raises(ValueError, match=r"frames \(1, 3, 24, 32\)\. .* squeeze axes"):
         read(hdf5(tmp_path / "b.h5", scene()[np.newaxis]))
 
@@ -67,7 +71,7 @@ def test_a_store_of_our_own_is_no_camera(tmp_path: Path) -> None:
     one = read(scene())
     both = readers.two_bands(one, read(scene() + 1), bands=("8-14", "9.5"), offset=0.0)
     store.save(both, tmp_path / "scene.zarr", store.provenance({}))
-    expected = r"Missing array \(time, y, x\) in 'scene.zarr'.*dbthermal is a capture as it is"
+    expected = r"Missing array \(time, y, x\) in 'scene.zarr'.*a store is a capture"
     with pytest.raises(ValueError, match=expected):
         read(tmp_path / "scene.zarr")
 
@@ -512,9 +516,8 @@ def netcdf(path: Path, version: int, *, records: bool, time: bool = False) -> Pa
     for place in range(2):  # once without, once with the place where data begin
         at, entries = place and len(start + tagged(11, *entries)), []
         for name, values in arrays.items():
-            over = numbers(values.ndim, *range(values.ndim)) + (
-                unit if name == b"frames" else tagged(12)
-            )
+            over = numbers(values.ndim, *range(values.ndim))
+            over += unit if name == b"frames" else tagged(12)
             kind = 6 if name == b"time" else 8 if version == 5 else 3
             size = values.nbytes // (3 if records else 1)
             entry = struct.pack(">i", kind) + numbers(size) + struct.pack(offset, at)

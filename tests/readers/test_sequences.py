@@ -134,7 +134,10 @@ def test_raw(tmp_path: Path) -> None:
     warming = np.einsum("t,y,x->tyx", np.arange(20), np.arange(24), np.linspace(0.0, 1.0, 32))
     for rise, is_told in ((warming, True), (np.zeros(1), False)):
         path.write_bytes((20000 + pattern + rise + noise).astype("<u2").tobytes())
-        assert bare(path).sizes["y"] == 24
+        assert not bare(path).attrs.get("warnings")
+        for height in (8, 12, 48, 96):  # parts of a frame, and several
+            with pytest.warns(UserWarning, match=f"repeat after 24, not {height}"):
+                bare(path, shape=(height, 32))
         if not is_told:
             assert bare(path, shape=(32, 24)).sizes["y"] == 32  # of a scene at rest
             continue

@@ -20,9 +20,8 @@ def draw_compared(fill: float = 1.0, **attrs: object) -> Figure:
 def draw_condition(fill: float = 1.0, **attrs: object) -> Figure:
     """Draw the condition number of a pair of bands, infinite on the diagonal."""
     matrix = fill * array("first second", 2, 2, **attrs)
-    return figures.calibration.condition_matrix(
-        matrix.where(matrix["first"] != matrix["second"], np.inf), 9
-    )
+    matrix = matrix.where(matrix["first"] != matrix["second"], np.inf)
+    return figures.calibration.condition_matrix(matrix, 9)
 
 
 def draw_over_bound(**attrs: object) -> Figure:
@@ -56,9 +55,8 @@ def separated(fill: float = 1.0) -> xr.Dataset:
 
 def draw_truth(fill: float = 1.0, **attrs: object) -> Figure:
     """Draw the truth of a pixel beside its estimate."""
-    return figures.scenes.truth_and_estimate(
-        separated().assign_attrs(attrs), separated(fill), (1, 2)
-    )
+    truth = separated().assign_attrs(attrs)
+    return figures.scenes.truth_and_estimate(truth, separated(fill), (1, 2))
 
 
 def test_film() -> None:

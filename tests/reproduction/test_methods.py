@@ -58,10 +58,8 @@ def solve(capture: xr.Dataset, method: str, settings: Any = None, **options: Any
 @pytest.fixture(scope="module")
 def heated() -> xr.Dataset:
     """Scene of thirty pixels heated from 20 to 60 C, someone walking by."""
-    rng = np.random.default_rng(2)
-    return simulation.independent_pixels(
-        TIME, GLASS, Background(), 30, rng, start=293.15, stop=333.15
-    )
+    rng, span = np.random.default_rng(2), dict[str, Any](start=293.15, stop=333.15)
+    return simulation.independent_pixels(TIME, GLASS, Background(), 30, rng, **span)
 
 
 @pytest.fixture(scope="module")
@@ -192,9 +190,8 @@ def half_black() -> xr.Dataset:
     """
     share = np.where(np.arange(40) < 20, 1.0, 0.5) * np.ones((3, 20, 1))
     hair = (1.0 + 1e-12 * np.arange(3.0))[:, np.newaxis, np.newaxis]
-    return capture_of(
-        [mixing.leaving(share, curve.counts(HOT), curve.counts(ROOM)) * hair for curve in CURVES]
-    )
+    levels = [(curve.counts(HOT), curve.counts(ROOM)) for curve in CURVES]
+    return capture_of([mixing.leaving(share, *pair) * hair for pair in levels])
 
 
 def test_bcp_by_hand() -> None:
@@ -242,9 +239,8 @@ Scene = tuple[xr.Dataset, xr.Dataset, xr.Dataset]
 def noisy(noise: tuple[float, float], pixels: int) -> Scene:
     """Scene, capture and response: glass from 20 to 60 C, someone walking by."""
     rig, rng = Rig(noise=noise), np.random.default_rng(41)
-    scene = simulation.independent_pixels(
-        LONG, GLASS, Background(), pixels, rng, start=293.15, stop=333.15
-    )
+    span: Any = {"start": 293.15, "stop": 333.15}
+    scene = simulation.independent_pixels(LONG, GLASS, Background(), pixels, rng, **span)
     return scene, simulation.observe(scene, rig.response(), rng), rig.response()
 
 

@@ -81,10 +81,8 @@ def test_cells_compose(path: Path) -> None:
 
 def code_lines(path: Path) -> list[str]:
     """Lines of code without those of the parameters, imports, comments and blanks."""
-    tagged = [
-        cell for cell in cells(path, "code") if "parameters" not in cell.metadata.get("tags", ())
-    ]
-    lines = [line.strip() for cell in tagged for line in cell.source.splitlines()]
+    plain = [it for it in cells(path, "code") if "parameters" not in it.metadata.get("tags", ())]
+    lines = [line.strip() for cell in plain for line in cell.source.splitlines()]
     return [line for line in lines if line and not line.startswith(("#", "import ", "from "))]
 
 

@@ -116,9 +116,8 @@ def pulses() -> Floats:
     """Reflection in the left half, in the first band's unit (time, y, x)."""
     rng = np.random.default_rng(4)
     start = rng.uniform(0.0, 18.0, (6, 1, HEIGHT, WIDTH))
-    inside = (TIME[:, np.newaxis, np.newaxis] - start > 0) & (
-        TIME[:, np.newaxis, np.newaxis] - start < 1.5
-    )
+    since = TIME[:, np.newaxis, np.newaxis] - start
+    inside = (since > 0) & (since < 1.5)
     return np.asarray(0.03 * inside.sum(axis=0) * (np.arange(WIDTH) < WIDTH // 2))
 
 

@@ -107,9 +107,8 @@ def test_walkers(made: Made) -> None:
 
 def test_independent_pixels(rng: np.random.Generator) -> None:
     """Each pixel has its own curve and background, all from start to stop, with the same glass."""
-    made = simulation.independent_pixels(
-        TIME, GLASS, Background(), 50, rng, start=293.15, stop=333.15
-    )
+    span: Any = {"start": 293.15, "stop": 333.15}
+    made = simulation.independent_pixels(TIME, GLASS, Background(), 50, rng, **span)
     assert dict(made["object_temperature"].sizes) == {"time": 120, "y": 1, "x": 50}
     ends = made["object_temperature"].isel(time=[0, -1], y=0)
     np.testing.assert_allclose(ends.T, [[293.15, 333.15]] * 50, rtol=0, atol=1e-10)
