@@ -122,6 +122,9 @@ def _joining(most: int, event: Mask) -> joining.Scratch:
     )
 
 
+_TOGETHER = 2048  # frames whose functions are made in one matrix, of their number squared
+
+
 @lru_cache(maxsize=4)
 def _tree(times: bytes, events: bytes | None) -> Tree:
     """Pieces of each level of halving, down to those whose polynomial is any curve.
@@ -160,14 +163,17 @@ def _tree(times: bytes, events: bytes | None) -> Tree:
 
 def _of_level(time: Array, edges: Whole) -> Iterator[tuple[Array, int]]:
     """Yield the `_functions` of pieces without a shutter event, between edges; quicker together."""
-    first = np.isin(np.arange(time.size), edges)
-    columns, start = smooth.piecewise(time, first, np.empty((time.size, 0))).functions, 0
-    for piece in map(slice, edges[:-1], edges[1:]):
-        length = piece.stop - piece.start
-        order = min(smooth.PIECE_ORDER, length)
-        basis = np.ascontiguousarray(columns[piece, start : start + order])
-        yield basis, pieces.FUNCTIONS if length > smooth.PIECE_ORDER else order
-        start += order
+    step = max(1, _TOGETHER * (len(edges) - 1) // time.size)
+    for group in range(0, len(edges) - 1, step):
+        bounds, start = edges[group : group + step + 1], 0
+        part = time[bounds[0] : bounds[-1]]
+        first = np.isin(np.arange(bounds[0], bounds[-1]), bounds)
+        columns = smooth.piecewise(part, first, np.empty((part.size, 0))).functions
+        for begin, stop in zip(bounds[:-1] - bounds[0], bounds[1:] - bounds[0], strict=True):
+            order = min(smooth.PIECE_ORDER, stop - begin)
+            basis = np.ascontiguousarray(columns[begin:stop, start : start + order])
+            yield basis, pieces.FUNCTIONS if stop - begin > smooth.PIECE_ORDER else order
+            start += order
 
 
 def _functions(time: Array, segment: Whole) -> tuple[Array, int]:
