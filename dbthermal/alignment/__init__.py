@@ -34,15 +34,13 @@ def align(
     """Resample all bands onto one clock, and onto the first band's grid.
 
     The band with the most noise relative to its signal, or `clock`, keeps its samples in time. The
-    others are interpolated at its exposure times by the expected value between four frames: the
-    line between two for a random walk, nearly a cubic for a smooth signal. An offset of whole
-    frames is a pure shift.
+    others are interpolated at its exposure times by cubics through four frames, bent more or less
+    where rapid changes would else not be as large as in that band.
 
     Frames are NaN in a band across a gap or a change of `segment`, past an end, and where the
     camera gave none (NaN, or a copy of the frame before). A sample is NaN where the signal steps by
     five standard deviations of noise between two frames, and beside it, where a curve overshoots.
-    Interpolation makes the noise of a band smaller, by up to 0.8 (`noise_factor`), and correlates
-    neighbouring frames.
+    Interpolation lessens the noise (`noise_factor`), and correlates neighbouring frames.
 
     TypeError or ValueError if an argument is not as described, no offset is found, one leaves no
     frame that all bands have, or a band's clock was set while it ran: its stamps step, and the

@@ -7,6 +7,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
+from scipy.sparse import csr_array
 
 from dbthermal import _numbers, schema
 from dbthermal._arrays import Array, Mask
@@ -16,21 +17,18 @@ _COINCIDENT: Final = 0.01  # distance within which a sample is taken as it is [f
 _GAP: Final = 1.5  # longest gap that is interpolated across [frame period]
 _EVEN: Final = 0.05  # largest relative deviation of a step from the median of an even clock [1]
 _MINIMUM_FRAMES: Final = 2
-_SWING: Final = 0.125  # of the largest step, by which a curve may leave the line beside a step
 _ROW: Final = 64  # fewest frames in a row, of a recording that pauses
-PAUSE: Final = 20
-"""Length from which a gap in a camera's frames is a pause of the recording [frame period]."""
+PAUSE: Final = 20  # gap in a camera's frames from which it is a pause [frame period]
 
 
 @dataclass(frozen=True)
 class Interpolation:
-    r"""Interpolation in time by the expected value between four frames.
+    r"""Interpolation in time by a line between two frames, bent by those around them.
 
     .. math:: I(t) = (1 - w) I_{before} + w I_{after} + \sum_{i=-1}^{2} b_i I_{before + i}
 
-    The bend b is 0 for a random walk, and without four frames in a row; for a smooth signal the
-    result is nearly the cubic. Half-way between frames the line keeps 71 % of a change of four
-    frames from crest to crest, the cubic 88.
+    Half-way between frames the line keeps 71 % of a change of four frames from crest to crest, the
+    cubic 88. Without four frames in a row the bend b is 0.
     """
 
     before: Whole  # frames (wanted)
@@ -39,6 +37,7 @@ class Interpolation:
     bend: Array  # b (wanted, 4) [1]
     valid: Mask  # false across a gap or past an end (wanted)
     stamps: Array  # exposure times (time) [s]
+    swing: float = 0.125  # of the largest step, by which a curve may leave the line beside a step
 
     def apply(
         self, frames: npt.NDArray[Any], out: npt.NDArray[Any], largest_step: float = np.inf
@@ -68,7 +67,7 @@ class Interpolation:
                     off = np.tensordot(self.bend[place].astype(four.dtype), four, 1)
                     out[place] += np.nan_to_num(off)
                     neighbours = steps(before - 1, before) | steps(after, after + 1)
-                    unknown = unknown | neighbours & (np.abs(off) > _SWING * largest_step)
+                    unknown = unknown | neighbours & (np.abs(off) > self.swing * largest_step)
                 out[place][unknown] = np.nan
 
     def _step(self, frames: npt.NDArray[Any], before: int, after: int) -> npt.NDArray[Any]:
@@ -84,12 +83,14 @@ class Interpolation:
         excess = change - sum(neighbours) / max(len(neighbours), 1)
         return np.asarray(np.minimum(np.abs(change), np.abs(excess)))
 
-    def power(self) -> Array:
-        """Variance (wanted) [1] of an interpolated frame over that of a frame."""
-        weights = self.bend + 0.0
-        weights[:, 1] += 1.0 - self.weight
-        weights[:, 2] += self.weight
-        return np.asarray((weights**2).sum(axis=1))
+    def matrix(self, bend: float = 1.0) -> csr_array:
+        """Weights (wanted, time) [1] of all frames, with a multiple of the bend; 0 if not valid."""
+        weights = bend * self.bend
+        weights[:, 1:3] += np.stack([1.0 - self.weight, self.weight], axis=1)
+        wanted, place = np.nonzero(weights * self.valid[:, np.newaxis])
+        frames = np.stack([self.before - 1, self.before, self.after, self.after + 1], axis=1)
+        shape = self.valid.size, self.stamps.size
+        return csr_array((weights[wanted, place], (wanted, frames[wanted, place])), shape=shape)
 
     def labels(self, segment: Whole) -> Whole:
         """Segment (wanted) of each interpolated frame, from those of the samples (time)."""
@@ -181,11 +182,7 @@ def even_times(stamps: Array, reach: int) -> Array:
 
 
 def require_steady(stamps: Array, bands: list[str]) -> None:
-    """Refuse exposure times (band, time) [s] of frames that arrive in bursts.
-
-    Half of the steps must be the frame period within 50 %, and half of the frames must lie in rows
-    of at least `_ROW` without a pause.
-    """
+    """Refuse exposure times (band, time) [s] of frames that arrive in bursts."""
     for band, row in zip(bands, stamps, strict=True):
         times, period = row[np.isfinite(row)], frame_period(row)
         steps = np.diff(times)
@@ -207,13 +204,11 @@ def pauses(times: Array) -> Array:
     return np.stack([times[after - 1], times[after]], axis=1)
 
 
-def interpolation(
-    stamps: Array, present: Mask, wanted: Array, segment: Whole, growth: float
-) -> Interpolation:
+def interpolation(stamps: Array, present: Mask, wanted: Array, segment: Whole) -> Interpolation:
     """Interpolation of frames exposed at `stamps` (time) [s], at times `wanted` [s].
 
     Valid where a frame was exposed within 1 % of a period, or one each before and after in one
-    `segment` (time), at most one and a half frame periods apart. For `growth` see the function.
+    `segment` (time), at most one and a half frame periods apart. The bend is the cubic's.
     """
     usable = np.flatnonzero(present & np.isfinite(stamps))
     if usable.size < _MINIMUM_FRAMES:
@@ -231,44 +226,11 @@ def interpolation(
     between = (weight > 0) & (weight < 1) & joined[right - 1]
     valid = (weight == 0) | (weight == 1) | between
     in_a_row = np.pad(joined & (np.diff(usable) == 1), (1, 1))
-    four = (growth > 1.0) & between & in_a_row[right - 1] & in_a_row[right] & in_a_row[right + 1]
-    # Bend from the weights of four frames in a row, less those of the line.
-    nodes = times[np.clip(right[:, np.newaxis] + np.arange(-2, 2), 0, usable.size - 1)]
-    bend = np.zeros(nodes.shape)
-    bend[four] = _expected(nodes[four], wanted[four], growth)
-    bend[four, 1] -= 1.0 - weight[four]
-    bend[four, 2] -= weight[four]
+    four = between & in_a_row[right - 1] & in_a_row[right] & in_a_row[right + 1]
+    # Bend: the cubic through four frames in a row (Lagrange), less the line.
+    nodes, itself = times[right[four, np.newaxis] + np.arange(-2, 2)], np.eye(4, dtype=bool)
+    away, spacing = wanted[four, np.newaxis] - nodes, nodes[:, :, np.newaxis] - nodes[:, np.newaxis]
+    bend = np.zeros((wanted.size, 4))
+    bend[four] = np.prod(np.where(itself, 1.0, away[:, np.newaxis] / (spacing + itself)), axis=2)
+    bend[four, 1:3] -= np.stack([1.0 - weight[four], weight[four]], axis=1)
     return Interpolation(usable[right - 1], usable[right], weight, bend, valid, stamps)
-
-
-def _expected(nodes: Array, wanted: Array, growth: float) -> Array:
-    """Weights (wanted, 4) of samples at four nodes (wanted, 4), for values at the times wanted.
-
-    Universal kriging with a linear trend (Matheron 1973, doi:10.2307/1425829) of the generalised
-    covariance |h|^growth - h^2, which has a limit at a growth of 2.
-    """
-    times = np.column_stack([nodes, wanted]) - wanted[:, np.newaxis]
-    times /= np.diff(nodes).mean(axis=1)[:, np.newaxis]
-    lag = np.abs(times[:, :, np.newaxis] - times[:, np.newaxis])
-    growth += 1e-7 * (growth == 2.0)
-    covariance = (lag**growth - lag**2) / (growth - 2.0)
-    trend = np.stack([np.ones_like(times), times], axis=2)
-    system = np.zeros((len(wanted), 6, 6))
-    system[:, :4, :4] = covariance[:, :4, :4]
-    system[:, :4, 4:], system[:, 4:, :4] = trend[:, :4], np.swapaxes(trend[:, :4], 1, 2)
-    right = np.concatenate([covariance[:, :4, 4], trend[:, 4]], axis=1)
-    return np.asarray(np.linalg.solve(system, right[..., np.newaxis])[:, :4, 0])
-
-
-def growth(signal: npt.NDArray[Any]) -> float:
-    """Exponent a of signals (time, ...) in mean [x(t + h) - 2 x(t) + x(t - h)]^2 ~ h^a, 1 to 3.9.
-
-    From differences between lags of 1, 2 and 4 frames, which hold no noise: 1 for a random walk or
-    no change, 4 for a signal that is smooth from frame to frame.
-    """
-    spread = []
-    for lag in (1, 2, 4):
-        bend = signal[2 * lag :] - 2.0 * signal[lag:-lag] + signal[: -2 * lag]
-        spread.append(np.nanmean(bend**2) if np.isfinite(bend).any() else 0.0)
-    fine, coarse = np.diff(spread)
-    return float(np.clip(np.log2(coarse / fine), 1.0, 3.9)) if min(fine, coarse) > 0.0 else 1.0

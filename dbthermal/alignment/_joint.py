@@ -24,8 +24,7 @@ from dbthermal.alignment._reflections import seen_apart, shift_of
 from dbthermal.alignment._resampling import STEP, on_one_clock
 from dbthermal.schema import Status
 
-_PIXELS: Final = 20_000  # of the image of means in which clocks and shift are estimated, at most
-_FRAMES: Final = 400  # of the same, at most
+_PIXELS, _FRAMES = 20_000, 400  # of means in which clocks and shift are estimated, at most
 _COMMON: Final = 0.5  # share of a square's pixels that a frame must have
 _ROUNDS, _VAIN = 8, 2  # clocks that are tried, at most, and in a row without improvement
 _LATE: Final = 0.02  # difference below which clocks are the same [frame]

@@ -17,10 +17,8 @@ from dbthermal.alignment import _splines as images
 from dbthermal.alignment._splines import Field, Information, Movie, Spline
 from dbthermal.noise import MAD
 
-WINDOW: Final = 2.5
-"""Deviation of the window in which neighbours share a ratio and a whole-pixel match [pixel]."""
-BLUR: Final = 1.2
-"""Deviation of the blur of all movies before they are matched, that nothing aliases [pixel]."""
+WINDOW: Final = 2.5  # deviation of what shares a ratio and a whole-pixel match [pixel]
+BLUR: Final = 1.2  # deviation of the blur of all movies before, that nothing aliases [pixel]
 
 # Pixels at the border that are left out: what the blur mirrors there does not move. Along the
 # baseline, simulated shifts there were 0.028 pixel off with none, 0.015 with 1, 0.018 with 2.
@@ -29,16 +27,14 @@ _MIRRORED: Final = 1.0
 _VALUE_NOISE: Final = 1.0 / (2.0 * np.sqrt(np.pi) * BLUR)
 _SLOPE_NOISE: Final = _VALUE_NOISE * np.sqrt(2.0 * (1.0 - np.exp(-0.25 / BLUR**2)))
 _PLANES: Final = 32  # functions of time by which whole pixels are matched
-_ROUNDS: Final = 12
-_ROBUST: Final = 4  # rounds of the weights of whole-pixel matches
+_ROUNDS, _ROBUST = 12, 4  # of a field, and of the weights of whole-pixel matches
 _CONVERGED: Final = 2e-3  # mean change of the field at its end, of coarser pixels larger [pixel]
 # Explained energy, in variances of noise, that chance does not reach at one of many shifts.
 _SIGNIFICANT: Final = 40.0
 _USUAL: Final = 0.95  # share of a pixel's samples that are no rare change
-# Rough matches count as if each were known so well [pixel].
-_ROUGH: Final = 0.5
-_PARTS: Final = 6  # along either side of the image, of which each is left out of a delay
-_NOISE_PIXELS: Final = 256  # that tell the noise of a movie
+_ROUGH: Final = 0.5  # deviation as which a rough match counts [pixel]
+# Parts along a side of the image, each left out of a delay; pixels that tell a movie's noise.
+_PARTS, _NOISE_PIXELS = 6, 256
 _RIDGE: Final = 1e-4  # of the largest information on a shift, where there is none
 
 

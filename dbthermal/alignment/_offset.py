@@ -2,8 +2,8 @@ r"""Time by which one camera lags another, from the rapid changes that both see.
 
 With the smooth part projected out, the first band holds the background b(t) and the second
 :math:`\rho \, b(t + \delta)`, both noise besides. A background moves in steps: its autocovariance R
-is a tent, and a parabola through the peak of the covariance C of the bands would be biased. Instead
-the second band is predicted from the first, interpolated in a line between the frames m and m + 1:
+is a tent, and a parabola through the peak of the covariance C would be biased. Instead the second
+band is predicted from the first, interpolated in a line between the frames m and m + 1:
 
 .. math:: \rho \, b(t + \delta) = h_0 b(t + m) + h_1 b(t + m + 1), \quad
    \delta = m + \frac{h_1}{h_0 + h_1}
@@ -17,7 +17,8 @@ The difference and the sum of both give :math:`\delta`. It is exact where R is s
 over two frames on either side of its peak: for steps, and for smooth changes.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -31,8 +32,7 @@ from dbthermal._arrays import Array, Mask, stride
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.noise import MAD
 
-_PIXELS: Final = 16384  # pixels of a capture that are compared, at most
-_SAMPLES: Final = 2**25  # samples of a band, at most: of a long capture fewer pixels
+_PIXELS, _SAMPLES = 16384, 2**25  # that are compared, of a capture and of a band, at most
 SEARCH: Final = 5  # largest lag that is searched by default, either way [frame]
 # Step of one clock against the other from which a lost frame or a set clock is suspected [frame].
 _CLOCK_STEP: Final = 0.5
@@ -42,6 +42,9 @@ _GROUPS: Final = 16  # groups of pixels of the jackknife
 _SIGNIFICANCE: Final = 6.0  # least covariance of the bands [standard deviation]
 _PRECISION: Final = 0.1  # largest standard deviation of an offset [frame]
 _ORDER: Final = 8  # smooth functions that are projected out
+TELLING: Final = 2**22  # samples of a band from which a bend is told, at most
+# Share of a bend, at most, deviation (half a frame late: 1.0 to 1.5 +- 0.12), and unlike rates [1].
+_MOST_BENT, _VAGUE, _ALIKE = 2.0, 0.25, 0.01
 
 
 @dataclass(frozen=True)
@@ -67,6 +70,10 @@ def time_offset(corrected: xr.Dataset, *, band: str | None = None, search: int =
     Positive: frame n of this band was exposed that much **later** than frame n of the first. Where
     the capture has the cameras' own stamps, it is the delay beyond them.
 
+    Cameras side by side see a reflection at different pixels. Where most of what is reflected moves
+    one way, it comes to a pixel of one view earlier, and this looks like an offset, of which the
+    standard deviation says nothing; motion either way cancels. There, measure it otherwise.
+
     TypeError or ValueError if the band is missing, the search does not fit the capture's length,
     there are fewer than 16 usable pixels, nothing moves in both bands, their covariance is greatest
     at an end of the search, the bands share less than half of their frames, the offset is not known
@@ -85,12 +92,6 @@ def time_offset(corrected: xr.Dataset, *, band: str | None = None, search: int =
         Name of the band; by default the second.
     search : int
         Largest lag to search, either way [frame].
-
-    Notes
-    -----
-    Cameras side by side see a reflection at different pixels. Where most of what is reflected moves
-    one way, it comes to a pixel of one view earlier, and this looks like an offset, of which the
-    standard deviation says nothing; motion either way cancels. There, measure it otherwise.
 
     Examples
     --------
@@ -259,8 +260,9 @@ def _on_one_clock(signals: Array, stamps: Array, segment: smooth.Whole, reach: i
     result = np.empty((len(signals), times.size, signals.shape[2]))
     segments = np.empty(result.shape[:2], dtype=np.intp)
     for place, (movie, row) in enumerate(zip(signals, stamps, strict=True)):
-        plan = clocks.interpolation(row, present(movie), times, segment, 1.0)
-        plan.apply(movie, result[place])
+        plan = clocks.interpolation(row, present(movie), times, segment)
+        result[place] = plan.matrix(0.0) @ np.nan_to_num(movie)
+        result[place, ~plan.valid] = np.nan
         segments[place] = plan.labels(segment)
     return _Pair(result, segments, times)
 
@@ -352,3 +354,51 @@ def _delays(cross: Array, auto: Array) -> Array:
         share = 0.5 - 0.5 * (before - after) / (near - far) * (near + far) / (before + after)
         delays.append(lag + share)
     return np.stack(delays, axis=1)
+
+
+@np.errstate(divide="ignore", invalid="ignore")
+def bent(
+    plan: clocks.Interpolation, pair: Array, times: Array, segment: smooth.Whole, largest: float
+) -> clocks.Interpolation:
+    r"""Interpolation of a band x with which its rapid changes are as large as the reference y's.
+
+    Products of neighbouring frames tell their ratio k without noise. Total least squares of samples
+    without a step of `largest`, with covariances C, yields k if a share of the bend (else 1) solves
+
+    .. math:: \sigma_y^2 (C_{yx} - k C_{xx}) + k \sigma_x^2 (C_{yy} - k C_{yx}) = 0
+
+    The `pair` (2, time, pixel) [count] is of y at the `times` [s], and of x at its own.
+    """
+    timed, valid = present(pair[1]) & np.isfinite(plan.stamps), plan.valid & present(pair[0])
+    both, rate = present(pair[0]) & timed, clocks.frame_period(plan.stamps)
+    alike = abs(clocks.frame_period(times) - rate) < _ALIKE * rate
+    if not (alike and plan.bend.any() and min(valid.sum(), timed.sum()) >= _MINIMUM_FRAMES):
+        return plan
+    try:
+        power = np.square(noises.estimate(pair[0, both], pair[1, both], times[both]))
+    except ValueError:  # without noise
+        return plan
+    # Rapid changes of the reference, of a line, and of the cubic, and samples without a step.
+    matrices, dot = (plan.matrix(0.0), plan.matrix()), partial(np.einsum, "tp,tp->p")
+    films = pair[0], *(matrix @ np.nan_to_num(pair[1]) for matrix in matrices)
+    y, line, x = (_rapid(film, times, valid, segment) for film in films)
+    replace(plan, swing=np.inf).apply(pair[1], film := np.empty_like(y), largest)
+    used = np.isfinite(film)
+    # White noise is in neighbours as it is in the smooth functions; the bend acts alike in pixels.
+    pairs = (y, valid), (_rapid(pair[1], plan.stamps, timed, segment), timed)
+    autos = [dot(z[1:], z[:-1]) / np.sum(it[1:] & it[:-1]) for z, it in pairs]
+    auto_y, auto_x = np.array(autos) + _ORDER / valid.sum() * power[:, np.newaxis]
+    late, early = dot(y[1:], x[:-1]), dot(y[:-1], x[1:])
+    cross = 0.5 * (late + early) * np.sqrt(np.sum(auto_y * auto_x) / np.sum(late * early))
+    white, forces = used.sum(axis=0) * (1.0 - _ORDER / valid.sum()), []
+    for film, matrix in zip((line, x), matrices, strict=True):
+        common, noisy = dot(y, film * used), (matrix**2).sum() / valid.sum() * white * power[1]
+        force = power[0] * (common * auto_x - (dot(film, film * used) - noisy) * cross)
+        level = (dot(y, y * used) - white * power[0]) * cross - common * auto_y
+        force += power[1] * cross.sum() / auto_x.sum() * level
+        forces.append([group.sum() for group in np.array_split(force, _GROUPS)])
+    before, after = forces @ np.column_stack([np.ones(_GROUPS), 1.0 - np.eye(_GROUPS)])
+    share, *without = before / (before - after)  # no force is left; jackknife as above
+    if np.sqrt((_GROUPS - 1) * np.var(without)) <= _VAGUE and 0.0 <= share <= _MOST_BENT:
+        return replace(plan, bend=share * plan.bend, swing=np.inf)
+    return plan

@@ -25,18 +25,14 @@ from dbthermal.alignment import _splines as images
 from dbthermal.alignment._offset import noise_levels, sample
 from dbthermal.alignment._splines import Movie
 
-SMALLEST: Final = 24
-"""Rows and columns of an image whose bands are matched, at least."""
-
+SMALLEST: Final = 24  # rows and columns of an image whose bands are matched, at least
 _ROWS: Final = 32  # that are read at a time
-_COMMON: Final = 0.5  # share of the pixels that a frame must have in every band
-_MISSING: Final = 0.1  # share of the frames that a pixel may lack
+_COMMON, _MISSING = 0.5, 0.1  # of pixels that a frame must have, and frames that a pixel may lack
 _PIXELS: Final = 1024  # that tell the frames, about
 # Functions of time: 14 fields of 220 to 300 frames are off by .021 pixel along the baseline (.020
 # with 128, of 36 fields 1.2 and 1.4 times as much with 32 and with whole films); and pixels that
 # tell each of them.
-_PLANES: Final = 96
-_FOR_EACH: Final = 8
+_PLANES, _FOR_EACH = 96, 8
 # Of displaced windows: frames, number along either side of the image, and their sides [pixel].
 _FRAMES, _ALONG, _SIDES = 400, 8, (8, 16)
 _BLUR: Final = 2.0  # before a displacement is looked for [pixel]

@@ -26,8 +26,7 @@ _START: Final = 20  # the same of the image on which whole pixels are matched
 # entered.
 _PERIODS: Final = (5.0, 10.0, 20.0, 80.0)
 _SLOW: Final = 20.0  # those of a delay, at least
-_MORE: Final = 1.25
-_AGREE: Final = 4.5
+_MORE, _AGREE = 1.25, 4.5
 _KNOWN: Final = 0.2  # largest deviation of a shift by the data of a window alone [pixel]
 _WIDE: Final = 6.0  # deviation of the window in which a field and its data are compared [pixel]
 _RIDGE: Final = 1e-6  # of the largest information, where there is none
@@ -167,8 +166,9 @@ def _coarse(
         gain, distance = np.inf, 0.0
         if before is not None:
             gain = np.mean((sizes - size)[earlier])
-            # A field of slower changes must fit the data of the more robust one.
+            # A field of slower changes must fit the data of the more robust one if within a pixel.
             distance = begin.disagreement(before, level.centres(), field)
+            distance *= np.mean(sizes[earlier]) < 0.0
         if resolved.any() and gain > np.log(_MORE) and distance < _AGREE:
             before, earlier, sizes = data, resolved, size
             result = (replace(capture, valid=valid), tried, period, field)

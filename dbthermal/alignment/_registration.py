@@ -34,8 +34,7 @@ _NEWTON, _CONVERGED, _MARGIN, _DEGREE, _CUT = 40, 1e-4, 4, 2, 3.0
 _RIGID: Final = 0.01
 _FLOOR: Final = 1e-3  # of the residuals' mean variance, in every combination of times
 _QUARTER: Final = 0.25  # of the texture, whose residual is the scale
-_LEAST_CORRELATION: Final = 0.5
-_LEAST_OVERLAP: Final = 0.5  # of the image: the last rows of two views correlate by chance
+_LEAST_CORRELATION, _LEAST_OVERLAP = 0.5, 0.5  # the last rows of two views correlate by chance
 
 
 def register(

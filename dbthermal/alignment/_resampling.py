@@ -1,7 +1,6 @@
 """Resampling of all bands: views onto one pixel grid by polynomials, and onto one clock."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -13,7 +12,7 @@ from dbthermal import _numbers, _rows, schema
 from dbthermal._arrays import Array, Mask
 from dbthermal._coordinates import laid_on
 from dbthermal.alignment import _clocks as clocks
-from dbthermal.alignment._offset import SEARCH, noise_levels, require_one_clock, sample, time_offset
+from dbthermal.alignment import _offset as lags
 from dbthermal.alignment._splines import Movie
 
 TRANSFORM: Final = schema.Variable(
@@ -189,7 +188,7 @@ def on_one_clock(
     corrected: xr.Dataset,
     *,
     offset: float | xr.DataArray | None = None,
-    search: int = SEARCH,
+    search: int = lags.SEARCH,
     clock: str | None = None,
     reflection_shift: xr.Dataset | None = None,
     lazy: bool = False,
@@ -204,27 +203,29 @@ def on_one_clock(
         alike, _ = moved(corrected, reflected(reflection_shift, corrected), lazy=lazy)
     offsets = _offsets(alike, offset, names, search)
     stamps = clocks.exposure_times(corrected) + offsets[:, np.newaxis]
-    signals = sample(corrected)
+    signals = lags.sample(corrected)
     for band in () if offset is None else range(1, len(names)):  # `time_offset` has done it
         pair = [0, band]
-        require_one_clock(corrected.isel(band=pair), signals[pair], stamps[pair])
+        lags.require_one_clock(corrected.isel(band=pair), signals[pair], stamps[pair])
     # The clock of the noisiest band, relative to its signal.
-    noise, relative = noise_levels(signals, stamps)
+    noise, relative = lags.noise_levels(signals, stamps)
     if clock is not None and clock not in names:
         raise ValueError(f"Unknown clock '{clock}'. Must be one of the bands {names}.")
     reference = int(np.argmax(relative)) if clock is None else names.index(clock)
     times, segment = clocks.fill_times(stamps[reference]), schema.segments(corrected)
     # Plan the interpolation of each band, and how it reduces noise.
-    plans, factors = [], np.ones(len(names))
+    plans, factors, thin = [], np.ones(len(names)), -(-signals[0].size // lags.TELLING)
     # Frames that are NaN, or a copy of the one before, in every block of rows.
     blocks = (counts.isel(y=rows).values for rows in _rows.blocks(counts.shape))
     copies = [[clocks.missing(single(film)) for film in block] for block in blocks]
     missing = np.all(copies, axis=0)
     for band, (row, absent) in enumerate(zip(stamps, missing, strict=True)):
-        plan = clocks.interpolation(row, ~absent, times, segment, clocks.growth(signals[band]))
-        plans.append(replace(plan, valid=plan.valid & (plan.labels(segment) == segment)))
-        power = plans[band].power()[plans[band].valid]  # of independent noises
-        factors[band] = np.sqrt(np.mean(power)) if power.size else 1.0
+        plan = clocks.interpolation(row, ~absent, times, segment)
+        plan.valid[plan.labels(segment) != segment] = False
+        shown = np.stack([signals[it, :, ::thin] for it in (reference, band)])
+        plans.append(lags.bent(plan, shown, times, segment, np.sqrt(3.0) * steps * noise[band]))
+        square = (plans[band].matrix() ** 2).sum()  # of independent noises
+        factors[band] = np.sqrt(square / max(plan.valid.sum(), 1))
 
     def aligned(rows: slice) -> Movie:
         """Counts of some rows at the times of the reference."""
@@ -261,7 +262,7 @@ def _offsets(
 ) -> Array:
     """Offset of each band against the first [s]."""
     if offset is None:
-        measured = [time_offset(corrected, band=name, search=search) for name in names[1:]]
+        measured = [lags.time_offset(corrected, band=name, search=search) for name in names[1:]]
         return np.array([0.0, *measured])
     if isinstance(offset, xr.DataArray):
         values = schema.band_values(offset, names, "the time offset", "s")

@@ -32,8 +32,7 @@ _ROWS: Final = 4  # rows that are moved at a time, and stay in the cache
 _EDGE: Final = 3  # pixels by which an image on splines is mirrored at its border
 _VARIANCE: Final = 1.0 / 3.0  # of a cubic B-spline [pixel^2]
 # Pixels between two nodes, at least, and nodes along the longer side, at most.
-_SPACING: Final = 6.0
-_NODES: Final = 13
+_SPACING, _NODES = 6.0, 13
 _FREEDOM: Final = 3.0  # degrees of freedom of a bending's distribution
 # Penalties that are tried, over the mean information of a node; and over the last one.
 _PENALTIES: Final = 10.0 ** np.arange(-3.0, 5.0)

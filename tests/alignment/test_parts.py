@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
-from scipy.interpolate import CubicSpline
+from scipy.special import expit
 
-from dbthermal import schema
-from dbthermal.alignment import _clocks as clocks
+from dbthermal import alignment, schema
 from dbthermal.alignment import _joint as joint
 from dbthermal.alignment._planes import Scale
 
@@ -104,15 +103,20 @@ def test_a_square_without_some_samples_is_still(monkeypatch: pytest.MonkeyPatch)
     assert np.abs(off[..., 1:]).max() < 0.02
 
 
-def test_lines_and_splines_are_what_is_expected() -> None:
-    """Of a random walk the line, of its integral the natural spline; growth is told from noise."""
-    nodes, wanted = np.array([[0.0, 1.0, 2.0, 3.0]]), np.array([1.3])
-    np.testing.assert_allclose(clocks._expected(nodes, wanted, 1.0), [[0, 0.7, 0.3, 0]], atol=1e-9)
-    spline = CubicSpline(nodes[0], np.eye(4), bc_type="natural")(wanted)
-    np.testing.assert_allclose(clocks._expected(nodes, wanted, 3.0), spline, rtol=0, atol=1e-9)
-    limit = [clocks._expected(nodes, wanted, growth) for growth in (1.999, 2.0, 2.001)]
-    np.testing.assert_allclose(limit[::2], [limit[1]] * 2, atol=1e-4)
-    noise = np.random.default_rng(1).normal(size=(2, 4000, 50))
-    assert clocks.growth(np.cumsum(noise[0], axis=0) + noise[1]) == pytest.approx(1.0, abs=0.1)
-    wave = 30.0 * np.sin(np.arange(4000.0) / 5.0)
-    assert clocks.growth(wave[:, np.newaxis] + noise[1]) == pytest.approx(3.9, abs=0.1)
+@pytest.mark.parametrize("clock", ["8-14", "9.5"])
+def test_rapid_changes_keep_their_size_between_frames(clock: str) -> None:
+    """Half-way, pulses of three frames are as large in the interpolated band as in the other."""
+    rng, film = np.random.default_rng(1), np.zeros((2, 300, 1024))
+    time = np.arange(300.0)[:, np.newaxis] + [[[0.0]], [[0.5]]]
+    for start in rng.uniform(0.0, 300.0, (30, 1024)):
+        pulse = expit((time - start) / 0.2) - expit((time - start - 3.0) / 0.2)
+        film += rng.uniform(5.0, 15.0, 1024) * pulse * [[[1.0]], [[4.0]]]
+    film += rng.standard_normal(film.shape) * [[[2.0]], [[20.0]]]
+    counts = ("band", "time", "y", "x"), film.reshape(2, 300, 32, 32)
+    capture = xr.Dataset({"counts": counts}, {"band": ["8-14", "9.5"], "time": time[0, :, 0]})
+    aligned = alignment.align(capture, offset=0.5, clock=clock)
+    values, noise = aligned["counts"].values.reshape(2, -1), aligned["noise_factor"] * [2.0, 20.0]
+    (first, product), (_, second) = np.cov(values[:, np.isfinite(values).all(axis=0)])
+    first, second = np.array([first, second]) - noise.values**2
+    ratio = product / first if clock == "9.5" else second / product
+    assert ratio == pytest.approx(4.0, rel=0.015)
