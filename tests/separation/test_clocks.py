@@ -139,6 +139,23 @@ def test_memory_is_that_of_the_frames() -> None:
     assert max(peaks) < 1.5 * peaks[0]
 
 
+def test_memory_grows_with_the_frames_and_not_with_their_square() -> None:
+    """An object that steps in a recording of 20 minutes: four times the frames of 5 minutes."""
+    peaks = []
+    for frames in (3000, 12000):
+        time, rng = np.arange(frames) / 10.0, np.random.default_rng(1)
+        scene = simulation.walkers(time, (4, 4), GLASS, rng)
+        step = 6.0 * (scene["time"] >= time[1000])
+        moved = scene.assign(object_temperature=scene["object_temperature"] + step)
+        capture = simulation.observe(moved, RIG.response(), rng)
+        tracemalloc.start()
+        separation.solve(capture, RIG.response())
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    print(f"peaks [byte]: {peaks}")
+    assert peaks[1] < 6.0 * peaks[0]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("lag", "parallax"), [(0.05, 0.0), (0.14, 0.0), (0.14, 2.0)])
 def test_clocks_that_differ_are_undone(lag: float, parallax: float) -> None:

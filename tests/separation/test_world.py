@@ -58,6 +58,11 @@ WORLDS: dict[str, tuple[World, str, str]] = {
     ),
     "never registered, apart": (World(off=1.0, parallax=3.0, detail=DETAIL), "off that of", ""),
     "held in hand, far": (World(shake=(2.0, 2.0)), "image moved", ""),
+    "first camera blurs more, apart": (
+        World(parallax=3.0, blur=(1.3, 0.5)),
+        "not equally sharp",
+        "",
+    ),
     "breathing skin": (World(breath=0.5, detail=0.003, surface=(SKIN, SKIN)), "image moved", ""),
 }
 QUICK = list(WORLDS)[:8]
