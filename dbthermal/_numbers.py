@@ -54,3 +54,10 @@ def whole_number(name: str, value: int, within: tuple[int, int]) -> int:
     if not isinstance(value, int | np.integer):
         raise TypeError(f"Invalid {name} {value}. Must be a whole number.")
     return int(value)
+
+
+def truth_value(name: str, value: Any) -> bool:
+    """Value as True or False."""
+    if not isinstance(value, bool | np.bool_):
+        raise TypeError(f"Invalid {name} {value!r:.60}. Must be True or False.")
+    return bool(value)

@@ -186,6 +186,8 @@ CASES: list[tuple[Call, str]] = [
     (lambda: separation.separate(NOTHING, CAMERA), "corrected"),
     (lambda: separation.separate(cast(Any, "a.zarr"), CAMERA), "of type str. Must be a Dataset"),
     (lambda: separation.separate(CAPTURE, CAMERA, workers=cast(Any, 1.5)), "workers 1.5.*whole"),
+    (lambda: separation.separate(CAPTURE, CAMERA, outdoors=cast(Any, "no")), "outdoors 'no'.*True"),
+    (lambda: separation.without_calibration(CAPTURE), "separated"),
     (lambda: separation.solve(RAW, CAMERA), "correct_capture.*correction.corrected_by"),
     (lambda: solve("magic"), r"Unknown method 'magic'. Must be one of \['subspace', 'calibrated'"),
     (lambda: solve(response_kind="cubic"), "Unknown kind of response 'cubic'"),

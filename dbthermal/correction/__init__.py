@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from dbthermal import _rows, _text, schema
+from dbthermal import _numbers, _rows, schema
 from dbthermal._arrays import Mask
 from dbthermal._warnings import warned
 from dbthermal.correction._frames import sampling, unreported
@@ -165,8 +165,7 @@ def correct_capture(  # noqa: PLR0913 - the options of each step, by name
     """
     schema.check(capture, "capture")
     schema.check(correction, "correction")
-    if not isinstance(shutter, bool | np.bool_):
-        raise TypeError(f"Invalid shutter {_text.shown(shutter)}. Must be True or False.")
+    _numbers.truth_value("shutter", shutter)
     # Steps 1 and 2: distinct frames, shutter events, new offsets.
     before = correction if flat is None else renew_offset(correction, flat)
     maximum = int(correction.attrs.get("detector_maximum", DETECTOR_MAXIMUM))

@@ -13,7 +13,7 @@ import xarray as xr
 from dbthermal import mixing, schema
 from dbthermal import response as responses
 from dbthermal._arrays import Array, Mask
-from dbthermal._numbers import real_number, whole_number
+from dbthermal._numbers import real_number, truth_value, whole_number
 from dbthermal.limits._fisher import QUANTITIES, TEMPERATURES, Truth, deviations, smallest_order
 from dbthermal.limits._planner import CaptureDesign, plan, plan_durations
 from dbthermal.response import Curve, require_range
@@ -106,9 +106,7 @@ def bounds(
     if real_number("emissivity_std", emissivity_std) != 0 and not emissivity_std >= _LEAST_STD:
         label = f"Invalid emissivity_std {emissivity_std}"
         raise ValueError(f"{label}. Must be 0, or at least {_LEAST_STD}.")
-    if not isinstance(resting, bool | np.bool_):
-        raise TypeError(f"Invalid resting {resting!r}. Must be True or False.")
-    truth = _truth(scene, resting=resting)
+    truth = _truth(scene, resting=truth_value("resting", resting))
     names = [str(name) for name in scene["band"].values]
     curves = responses.curves(response, names, response_kind)
     for name in TEMPERATURES:

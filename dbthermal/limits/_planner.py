@@ -124,6 +124,7 @@ def plan(
     >>> limits.plan(table, noise)["best"].values.tolist()
     ['9.5', 'none']
     """
+    outdoors = _numbers.truth_value("outdoors", outdoors)
     if design is None:
         design = CaptureDesign(level=SKY_LEVEL) if outdoors else CaptureDesign()
     if not isinstance(design, CaptureDesign):

@@ -77,6 +77,7 @@ def without_calibration(result: xr.Dataset, *, drift: bool = True) -> xr.Dataset
     drift : bool
         Keep the part by a background that may have drifted along with the object.
     """
+    schema.check(result, "separated")
     alone = result.drop_vars(["cause", *BUDGETS.values()], errors="ignore")
     causes, by_drift = [*CALIBRATION], np.zeros(1) if drift else _drift(result)
     for name in (name for name, budget in BUDGETS.items() if budget in result):

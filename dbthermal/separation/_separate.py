@@ -137,7 +137,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     schema.check_corrected(corrected)
     names = [str(band) for band in corrected["band"].values]
     completable = check_stated(names, workers, prior, surroundings)
-    if outdoors and background_ratio is not None:
+    if _numbers.truth_value("outdoors", outdoors) and background_ratio is not None:
         raise ValueError("Invalid outdoors beside a background_ratio. State one of them.")
     response = response.assign(background_ratio_std=SKY) if outdoors else response
     inputs = check(corrected, response, get_method("subspace"), settings=settings)
