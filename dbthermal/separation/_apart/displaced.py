@@ -192,10 +192,8 @@ def paired(
     selected: slice | npt.NDArray[np.intp],
     fewest: int,
 ) -> Paired:
-    """Some pixels of some rows of a capture as `read`, their short gaps bridged.
-
-    The source is read if these rows are not kept: the others' samples are, in single precision.
-    """
+    """Read some pixels of some rows as `read` does, their short gaps bridged."""
+    # Samples of the second camera are kept, in single precision: a source is not read again.
     kept, place, bands = displacement.kept, (rows.start, rows.stop), capture.sizes["band"]
     resampled = kept.get(place)
     if resampled is None:
@@ -232,11 +230,8 @@ def read(
     fewest: int,
     grains: list[samples.Grain],
 ) -> tuple[Array, Mask, Bits, Array]:
-    """Read some rows of the reference band, and what the others show of the same reflections.
-
-    Of the block, the rows of the `source`, which hold those of `displacement.source(rows)`. As
-    `quality.read`; and the noise (first band and others, pixel) [1] over that of a sample.
-    """
+    """Read rows of both cameras with the same reflections, and their noise over a sample's [1]."""
+    # The block has the rows of the `source`, which hold those of `displacement.source(rows)`.
     reference, second_bands = displacement.reference, displacement.others
     needed = displacement.source(rows)
     inner = slice(rows.start - source.start, rows.stop - source.start)
@@ -290,11 +285,9 @@ def _used(weights: csr_array, rows: slice) -> tuple[Any, dict[str, Any]]:
 
 
 def without(weights: csr_array, bad: Mask, width: int) -> csr_array:
-    """Weights without the bad pixels, whose part the others take over; a plane stays one.
-
-    Where that part is large the weights stay as they are.
-    """
+    """Weights of the good pixels, which take over the bad pixels' part; a plane stays a plane."""
     lost = abs(weights) @ bad
+    # Where the part of bad pixels is large the weights stay as they are.
     rows = np.flatnonzero((lost > 0) & (lost <= _LOST_WEIGHT))
     if rows.size == 0:
         return weights

@@ -75,20 +75,17 @@ class Frames:
     @classmethod
     @np.errstate(invalid="ignore", divide="ignore")
     def of(cls, result: xr.Dataset) -> "Frames":
-        """Frames that tell the object of a result.
-
-        Polynomials through nodes that lie close together near the ends, as Chebyshev's do, repeat a
-        film that is one of them. Where they are off by more than a share of its deviation, in more
-        than a few of the samples, the object changes rapidly.
-        """
+        """Frames at which a result's object is solved: few if it changes smoothly, else all."""
         film, std = (result[name].values.reshape(result.sizes["time"], -1) for name in _OBJECT)
         time, every = result["time"].values, np.arange(len(film))
         functions = smooth.largest(time).functions
         count = _NODES * functions.shape[1]
+        # Polynomials through nodes close together near the ends (Chebyshev) repeat a smooth film.
         place = 0.5 * (1.0 - np.cos(np.pi * (np.arange(count) + 0.5) / count)) * np.ptp(time)
         nodes = np.unique(np.abs(time - time[0] - place[:, np.newaxis]).argmin(axis=1))
         weights = np.asarray(functions @ np.linalg.pinv(functions[nodes]), np.float32)
         sampled = looked_at(time.size)
+        # Off by more than a share of the deviation, in more than a few samples: a rapid object.
         off = np.abs(weights[sampled] @ film[nodes] - film[sampled]) / std[sampled]
         if nodes.size == time.size or not _most(off) < _NO_MATTER:
             return cls(every, None)
@@ -191,12 +188,7 @@ def solve(
     before: Joint | None = None,
     blur: float = 0.0,
 ) -> Joint | None:
-    """Solve the equations of all pixels, from a result that takes x(p) for x(r).
-
-    Or from one of inputs with the difference of a solution `before`. Of an object that changes
-    smoothly the combination without background is that of the `maps`, at the ratios of a material,
-    else that of the result. None where the object hardly differs between the two places.
-    """
+    """Solve the object of all pixels at both cameras' places; None if it hardly differs there."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         maps = maps if frames.smooth else None
         raw, variance, solved = _solvable(inputs, result, maps, material)
@@ -206,6 +198,8 @@ def solve(
         places = equations.solved
         change = system.change(inputs, equations.ways[relaxation.LOOSE], result, threads)
         shares = system.coefficients(inputs, raw, solved)[:, places]
+        # Of a smooth object the combination without background is that of the maps, at a material's
+        # ratios; else that of the result, which takes x(p) for x(r) or holds `before`.
         if maps is not None:
             target, size = _by_maps(inputs, maps, raw, material, result, places)
         else:
@@ -299,14 +293,12 @@ def _by_maps(
     result: xr.Dataset,
     places: Whole,
 ) -> tuple[Target, Floats]:
-    """Combination of the maps, and its deviation (solved) [K].
-
-    That of the noise and, of ratios of single pixels, of these.
-    """
+    """Combination without background from the maps, and its deviation (solved) [K]."""
     noise = inputs.noise[inputs.bands]
     ratio = system.ratio_of(raw)[:, places].astype(np.float64)
     weights = null_combination(ratio, noise)[0]
     combined, variance = maps.combined(weights, places)
+    # Ratios of single pixels add their deviation to that of the noise.
     if material is not None:
         std = result["reflection_ratio_std"].values[inputs.bands].reshape(len(noise), -1)[:, places]
         size = np.sqrt(noise[:, np.newaxis] ** 2 + (ratio * noise[0]) ** 2)  # eq. 4
@@ -400,11 +392,8 @@ def _emissivities(
 def _emission(
     films: Floats, band: tuple[Floats, Floats], emissivity: Floats, noise: float, few: slice
 ) -> tuple[Floats, Floats, Mask]:
-    """Emissivity of the first band as its slope over the object, its variance, and where it holds.
-
-    Of a few pixels, by the object's signals at both places (2, frame, solved), and those of the
-    band and the steps of the camera in it (frame, solved).
-    """
+    """Emissivity of the first band as its slope over the object, its variance, and its validity."""
+    # Object at both places (2, frame, solved) [K]; band: signal, steps of the camera in it [K].
     signal, at_p = films[..., few].astype(np.float64)
     slope, variance, energy, kernel = regression.lines(signal, band[0][:, few], noise)
     # A gradient as steep as the object's own change turns the step round: divide by it.
@@ -426,14 +415,11 @@ def _factor(
     blur: float,
     threads: Executor,
 ) -> Floats:
-    """Variance (pixel) [1] of the object over that of a pixel alone, by draws; NaN where unsettled.
-
-    The `std` (2, pixel) [K] is that of a pixel alone, and of its target through the emissivity; the
-    `variance` (loose) [K^2] that of the change.
-    """
+    """Variance of the object over that of a pixel alone (pixel) [1], by draws; NaN if unsettled."""
     displacement = inputs.displacement
     assert displacement is not None
     rng = np.random.default_rng(inputs.seed)
+    # Deviations of a pixel alone, and of its target through the emissivity (pixel) [K].
     size, off = std[..., np.newaxis]
     # Errors of single pixels, of the drawn noise scaled to their deviations.
     drawn = displacement.resample @ rng.standard_normal((size.size, _DRAWS))

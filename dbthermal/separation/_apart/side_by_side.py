@@ -72,15 +72,13 @@ def pooled(
     materials: Callable[..., Material | None],
     regroup: pool.Regroup | None = None,
 ) -> None:
-    """Separate with materials, from a result of each pixel alone before.
-
-    The first are those of the object and emissivities of pixels alone, and may be regrouped; the
-    second those of what the first make of these.
-    """
+    """Separate with materials, from a result of each pixel alone before."""
     assert inputs.displacement is not None
     frames = joint.Frames.of(before)
     objects: joint.Joint | None = inputs.displacement.found[_OBJECTS]
     shares, _ = neighbours.emissivities(inputs, before)
+    # The first materials are those of the object and emissivities of pixels alone, and may be
+    # regrouped; the second those of the object and emissivities that the first make.
     for turn in range(_TURNS):
         inputs = replace(inputs, difference=None if objects is None else objects.difference)
         # Of a smooth object the difference changes no rapid product.

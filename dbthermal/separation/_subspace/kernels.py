@@ -255,17 +255,15 @@ def mean(values: Array) -> float:
 
 @compiled
 def principal(matrix: Array, turned: Array, turns: Array, axis: Array) -> float:
-    """Largest eigenvalue of a symmetric matrix; its vector, of any length, in place.
-
-    Of two rows the vector is the longer of two expressions; of more they are turned in pairs until
-    the matrix is diagonal (Jacobi).
-    """
+    """Largest eigenvalue of a symmetric matrix; its vector, of any length, in place."""
     count = axis.size
+    # The longer of two expressions for the vector.
     if count == 2:
         a, b, d = matrix[0, 0], matrix[0, 1], matrix[1, 1]
         largest = 0.5 * (a + d) + sqrt(0.25 * (a - d) ** 2 + b * b)
         axis[0], axis[1] = (largest - d, b) if a >= d else (b, largest - a)
         return largest
+    # More rows are turned in pairs until the matrix is diagonal (Jacobi).
     for i in range(count):
         copy(matrix[i], turned[i])
         fill(turns[i], 0.0)

@@ -120,11 +120,9 @@ class SubspaceSettings:
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def separate(tile: Tile, settings: SubspaceSettings) -> Estimate:
-    """Separate one tile of two bands or more.
-
-    A pixel keeps its division of the time from a pass before, unless it has a flag.
-    """
+    """Separate one tile of two bands or more."""
     functions, kept, drift = _functions(tile), tile.division, settings.background_drift
+    # A pixel keeps its division of the time from a pass before, unless it has a flag.
     if kept is None or not kept.any():
         return _searched(tile, functions, drift)
     places = np.flatnonzero(kept.any(axis=0))
