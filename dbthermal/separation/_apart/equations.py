@@ -102,7 +102,7 @@ def ratio_of(emissivity: Floats) -> Floats:
 
 
 def inside(emissivity: Floats) -> Floats:
-    """Emissivities of the same ratios, none of them outside or at the end of (0, 1)."""
+    """Emissivities of the same ratios, all of them well inside (0, 1)."""
     ratio = ratio_of(emissivity)
     # e_m > 0 leaves 0 < 1 - e_1 < 1 / kappa.
     most = 1.0 / np.maximum(ratio.max(axis=0), 1.0)
@@ -117,7 +117,7 @@ def weights(inputs: Inputs, emissivity: Floats) -> Floats:
 
 
 def of_ratio(inputs: Inputs, material: Material) -> Floats:
-    """Variance (pixel) [1] of the first weight by that of a material's ratios, 0 without one."""
+    """Variance (pixel) [1] of the first weight by the material's ratios, 0 without a material."""
     noise = inputs.noise[inputs.bands]
     std = np.sqrt(ratio_variance(material.ratio, material.inverse_energy, noise))
     ratios = material.ratio, material.ratio + std
@@ -248,7 +248,7 @@ def change(inputs: Inputs, loose: Whole, result: xr.Dataset, threads: Executor) 
     moved = at_p[:, pixels] @ film - at_r
     bend = moved + across[:, pixels] @ film - at_r
     moved[unknown] = 0.0
-    # Smoothed, it is the change of e_1 u_1(x) and holds little of that of the reflection.
+    # Smoothed, it is the change of e_1 u_1(x) and holds little of the reflection's change.
     curves = moved @ functions.functions
     error = moved - curves @ functions.functions.T
     energy, lagged = (error**2).sum(axis=1), (error[:, 1:] * error[:, :-1]).sum(axis=1)

@@ -62,7 +62,7 @@ _GROWN: Final = 1e3
 
 @dataclass(frozen=True)
 class Frames:
-    """Frames at which a film is solved: a few of one that is smooth, else all."""
+    """Frames at which a film is solved: a few of a smooth film, else all."""
 
     nodes: Whole  # (node)
     weights: Floats | None  # of the nodes in each frame (frame, node); None of all frames
@@ -93,7 +93,7 @@ class Frames:
 
 
 def _most(values: Floats) -> float:
-    """Value that all but a few of those that are numbers do not exceed; NaN of none."""
+    """Value that all but a few of the finite values do not exceed; NaN without such values."""
     numbers = values[np.isfinite(values)]
     return float(np.quantile(numbers, _MOST)) if numbers.size else np.nan
 
@@ -154,7 +154,7 @@ class Joint:
             gaussian_filter1d(curves, 1.0, axis=axis, order=1) * component.astype(np.float32)
             for axis, component in zip((1, 2), off, strict=True)
         ]
-        # Without a solution x(p) was taken for x(r): they differ as those nearest do.
+        # Without a solution x(p) was taken for x(r): they differ as at the nearest solution.
         unsolved = np.isnan(self.signals[0]).all(axis=0).reshape(status.shape)
         near = distance_transform_edt(unsolved, return_distances=False, return_indices=True)
         square = np.mean((self.signals[1] - self.signals[0]) ** 2, axis=0).reshape(status.shape)
@@ -230,7 +230,7 @@ def solve(
         films, step = objects_at(sampled, equations, start)
         if not _most(np.abs(shares[1:].sum(axis=0) * (films[1] - films[0])) / size) > _MATTERS:
             return None
-        # The emissivities, if they are not those of a material.
+        # The emissivities, unless a material states them.
         emissivity = system.inside(raw)
         of_slope: Floats = np.zeros(solved.size)
         of_ratio: Floats = np.zeros(solved.size)
@@ -330,7 +330,7 @@ def _by_film(
     frames, places = result.sizes["time"], equations.solved
     film, stds = (result[name].values.reshape(frames, -1) for name in _OBJECT)
     stds = stds[looked_at(frames)][:, places]
-    # In units of the deviation or, of a method without one, of the noise.
+    # In units of the deviation or, of a method without deviations, of the noise.
     stds = np.where(np.isfinite(stds), stds, inputs.noise.min())
     film = smooth.bridge(copied(film), np.isin(np.arange(film.shape[1]), places))
     weights, curve = system.weights(inputs, raw)[1:, places], inputs.curves[inputs.bands[0]]
@@ -359,7 +359,7 @@ def _emissivities(
     band: tuple[Floats, Floats],
     threads: Executor,
 ) -> tuple[system.Equations, Floats, Floats]:
-    """Equations of the emissivities of the object at its own place, these, and e_1's variance."""
+    """Equations and emissivities of the object at its own place, and the variance of e_1."""
     emissivity, noise = system.inside(raw), inputs.noise[inputs.bands[0]]
     measured = np.isfinite(result["emissivity"].values[inputs.bands[0]].ravel())
     solved, step = equations.spread(np.ones(films.shape[2], dtype=bool)), np.zeros(len(raw[0]))

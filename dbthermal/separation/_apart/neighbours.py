@@ -40,7 +40,7 @@ SHARING: Final = 4.0 * np.pi * BLUR**2
 """Pixels that share an error of such a ratio: the inverse sum of the blur's squared weights."""
 
 BLURS: Final = (0.0, BLUR, 2.0 * BLUR)
-"""Those of a material, each wider than the one before."""
+"""Deviations of the blurs of a material, rising [pixel]."""
 
 # Deviation of the neighbourhood in which ratios are compared: that of a field and its data [pixel].
 _WIDE: Final = 6.0
@@ -130,7 +130,7 @@ def materials(
 def _survey(
     scatters: Scatters, per_pixel: xr.Dataset, noise: Array, places: npt.NDArray[np.intp]
 ) -> Survey:
-    """Survey of some pixels by their planes; of those of a sound model."""
+    """Survey of some pixels by their planes, without scatter where the model is not sound."""
     status = per_pixel["status"].values.ravel()[places]
     emissivity = per_pixel["emissivity"].sel(band=per_pixel.attrs["reference_band"]).values
     value = np.where(status == 0, emissivity.ravel()[places], np.nan)
@@ -178,8 +178,8 @@ def _blurred(sharp: Material, less: Material, more: Material, noise: Array) -> M
     measured = wide & np.isfinite(less.ratio[-1])
     last, whole = (np.abs(more.ratio / before.ratio - 1.0) for before in (less, sharp))
     # The last blur's change, or half of the whole, may be as much again beyond: of two simulated
-    # vessels 94 and 95 % of the intervals hold so, 90 and 94 % by the last change alone, 94 and 95
-    # % by the whole with 1.2 times the error.
+    # vessels 94 and 95 % of the intervals hold so, 90 and 94 % by the last change alone; by the
+    # whole, with 1.2 times the error, 94 and 95 %.
     change = np.fmax(last, 0.5 * whole)
     # A material too narrow for a blur has the median change of the others.
     usual = np.median(change[:, measured], axis=1, keepdims=True) if measured.any() else 0.0
@@ -192,7 +192,7 @@ def _blurred(sharp: Material, less: Material, more: Material, noise: Array) -> M
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def emissivities(inputs: Inputs, result: xr.Dataset) -> tuple[Floats, Floats]:
-    """Emissivities (band, pixel) [1] that lean on those around, and variance of the first's."""
+    """Emissivities (band, pixel) [1] that lean on neighbours', and the first band's variance."""
     raw, reference = system.first_emissivity(inputs, result), inputs.bands[0]
     variance = result["emissivity_std"].values[reference].ravel().astype(np.float64) ** 2
     sound = (result["status"].values.ravel() == 0) & (variance > 0)
@@ -213,15 +213,15 @@ def shared(
     weight, wide = weight / chi, _AROUND * min(shape)
     mean = neighbour_mean(value, weight, wide)
     mean = np.where(np.isfinite(mean), mean, value)
-    # Normal prior of the neighbourhood's mean and variance. To lean does not lessen a variance:
-    # neighbours share such errors. An unknown value has the neighbourhood's.
+    # Normal prior of the neighbourhood's mean and variance. Leaning does not lessen a variance:
+    # neighbours share such errors. An unknown value takes the neighbourhood's variance.
     prior = np.nan_to_num(neighbour_mean((value - mean) ** 2, weight, wide))
     variance = np.where(sound, variance * chi, np.where(prior > 0, prior, variance))
     return ((prior * weight * value + mean) / (prior * weight + 1.0)).ravel(), variance.ravel()
 
 
 def _median(values: Floats, weight: Floats) -> Floats:
-    """Median (y, x) of the pixels around; one without weight counts as their mean."""
+    """Median (y, x) of the pixels around; pixels without weight count as the mean around."""
     filled = np.where(weight > 0, values, np.nan_to_num(neighbour_mean(values, weight, _WIDE)))
     reach = round(_WIDE)
     # At every few pixels, then interpolated: it changes as slowly as its window is wide.

@@ -138,7 +138,7 @@ class Planes:
         for first in range(bands):
             for second in range(first, bands):
                 total = np.einsum("fp,fp->p", flat[first], flat[second])
-                # The noise of the background, which is the first band's, is in the bend of others.
+                # The other bands' bend holds the background's noise, which is the first band's.
                 share = (first == second) + bend[first] * bend[second] - (first == 0) * bend[second]
                 total = total / (noise[first] * noise[second]) - freedom * share
                 scatter[first, second] = scatter[second, first] = total
@@ -200,7 +200,7 @@ class Response(NamedTuple):
     series: Array  # signal of the first less the reference [K], of temperatures over the range
     middle: float  # of the range [K]
     half: float
-    bends: Array  # signals of the others less that of the first (band - 1, degree), of it [K]
+    bends: Array  # coefficients of u_m - u_1 in u_1 less the reference (band - 1, degree) [K]
 
 
 @compiled
@@ -251,7 +251,7 @@ def _straighten(
 def _without_object(
     signals: Array, emitted: npt.NDArray[np.float32], emissivity: Array, response: Response
 ) -> None:
-    """Take an object's signal (time, pixel) [K] out of those (band, time, pixel) [K], in place."""
+    """Take an object's signal (time, pixel) out of signals (band, time, pixel) [K], in place."""
     bands, frames, pixels = signals.shape
     for t in range(frames):
         for p in range(pixels):

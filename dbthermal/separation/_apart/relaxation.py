@@ -57,7 +57,7 @@ def other_bands(shares: Floats, bends: Floats, signal: Floats, result: Floats) -
 
 @inlined
 def _at_p(terms: Terms, pixel: int, signal: Floats, film: Floats) -> None:
-    """Signal u_1(x(p)) (frame) [K] of a pixel, of those at r (pixel, frame), in place."""
+    """Signal u_1(x(p)) (frame) [K] of a pixel, from all signals at r (pixel, frame), in place."""
     if terms.way[pixel] == LOOSE:
         change = terms.change[terms.place[pixel]]
         for t in range(film.size):

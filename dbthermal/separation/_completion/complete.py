@@ -167,7 +167,7 @@ def filled(
         measured = without_calibration(solve(corrected, response, **shared))
     scene = scenes.gather(inputs, result, measured, context.prior)
     sample = scene.sample()
-    if not scene.apart:  # else the result's reflections are those of two places
+    if not scene.apart:  # else the result's reflections come from two places
         scenes.require_same_capture(scene, result, sample)
     if context.surroundings is None:
         level = scenes.find_level(scene, sample)
@@ -330,7 +330,7 @@ def _bridge_rows(completed: xr.Dataset, frames: Mask, lacking: Mask, rows: slice
         films[0][place], films[1][place] = curves.T, np.sqrt(variances).T
         number[y, x] = np.maximum(number[y, x], gaps[y, x])
         release()
-    # Of the lacking samples those stay marked that a measured pixel now has.
+    # Lacking samples stay marked where a measured pixel now has a bridged value.
     bridged, status = lacking[:, rows], completed["status"].values[rows]
     bridged &= np.isfinite(completed[FILMS[0]].values[:, rows])
     bridged &= (status & np.uint32(schema.COMPLETED & ~Status.COMPLETED_FRAMES)) == 0

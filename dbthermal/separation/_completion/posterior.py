@@ -50,11 +50,11 @@ class Level:
     signal: Array | float  # first band's signal, less the reference (pixel) [K]
     std: Array | float  # (pixel) [K]
     fluctuation: float  # standard deviation over time [K]
-    rapid: float = np.inf  # that of its rapid changes [K]
-    scatter: float = np.inf  # of the logarithm of these between pixels [1]
+    rapid: float = np.inf  # standard deviation of its rapid changes [K]
+    scatter: float = np.inf  # of the logarithm of rapid changes between pixels [1]
 
     def at(self, places: Whole) -> "Level":
-        """Return the level of some pixels, each of its own."""
+        """Return the level of some pixels, an array each (pixel)."""
         arrays = (np.asarray(array, dtype=np.float64) for array in (self.signal, self.std))
         signal, std = (
             array[places] if array.ndim else np.full(places.size, array) for array in arrays
@@ -200,7 +200,7 @@ def _condition(
             for m in range(mean.shape[1] - 1):
                 slope = covariance[k, 1 + m, 0] / variance
                 normal[g, k, 0, m] = mean[k, 1 + m] + slope * off[k]
-                # The others are taken as independent given the first.
+                # The other emissivities are taken as independent given the first.
                 spread = covariance[k, 1 + m, 1 + m] - slope * covariance[k, 1 + m, 0]
                 normal[g, k, 1, m] = 1.0 / max(spread, 1e-8)
         share = np.exp(log - log.max())

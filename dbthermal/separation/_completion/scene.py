@@ -34,7 +34,7 @@ _FLUCTUATION: Final = 2.0
 _LEAST: Final = (0.2, 0.1)
 # Pixels from which the surroundings are estimated, and the residual of a result is judged.
 _SAMPLE: Final = 400
-_MOST, _FEW = 2**22, 64  # samples of a band of these, down to so few pixels of a long capture
+_MOST, _FEW = 2**22, 64  # their samples in a band, at most; and fewest pixels of a long capture
 # Pixels of a material that tell its emissivity, and how much they differ, at least.
 _FEWEST: Final = 4
 # Chance by which a pixel tells other emissivities than its material's: of three deviations.
@@ -62,7 +62,7 @@ class Scene:
     emissivity: Array  # measured, in the pixel or in its material (band, pixel) [1]
     covariance: Array  # (band, band, pixel) [1]
     general: Mixture  # prior on the emissivities of any pixel
-    offset: Array  # deviation of a pixel's offset against the others, of the other bands [K]
+    offset: Array  # deviation of a pixel's offset against other pixels, of the other bands [K]
     level: Level
     apart: bool  # the cameras do not see the same reflection in a pixel
     measured: Mask  # pixels without a flag (pixel)
@@ -255,7 +255,7 @@ def find_level(scene: Scene, sample: Sample) -> Level:
         estimates.append([static.level, static.covariance[-1, -1], before, fluctuation])
         if source != OWN:
             continue
-        # What measured pixels mirror of rapid changes: the fewer, the less it says of others.
+        # Rapid changes that measured pixels mirror: few such pixels say little of other pixels.
         std = curves.bins(*block).rapid(tile.noise[0]) / (1.0 - scene.emissivity[0, numbers])
         if (std := std[scene.measured[numbers] & np.isfinite(std)]).size:
             scatter = _SCATTER / float(np.sqrt(scene.measured.mean()))
@@ -264,7 +264,7 @@ def find_level(scene: Scene, sample: Sample) -> Level:
     if not estimates:
         return scene.level
     mean, after, before, fluctuation = np.concatenate(estimates, axis=1)
-    # Their mean, for those that are completed may be any of them: most of a scene may be at rest.
+    # The mean: a completed pixel may face any fluctuation; most of a scene may be at rest.
     level = replace(scene.level, fluctuation=max(float(np.sqrt(np.mean(fluctuation))), _LEAST[1]))
     # A posterior of precision 1 / after holds the prior's 1 / before.
     variance = 1.0 / np.maximum(1.0 / after - 1.0 / before, _NOTHING)

@@ -99,7 +99,7 @@ def fit(measured: Places, asked: Places, cost: Cost, limit: int = DEGREE) -> Gra
     if not fits:  # no pixel tells anything
         nothing, zero = np.full(asked[0].size, np.nan), np.zeros(pixels)
         return Gradient(0, nothing, nothing, (Left(zero, cost.square, cost.variance),) * 2)
-    # What pixels scatter beyond the highest degree is no gradient of theirs.
+    # Scatter of pixels beyond the highest degree is no gradient.
     beyond = np.sum(fits[-1][-1] ** 2 - cost.variance) / np.sum(cost.square**2)
     variance = cost.variance + max(float(beyond), 0.0) * cost.square**2
     chosen, highest = 0, 0.0
@@ -137,8 +137,8 @@ def _spreads(fits: list[Left]) -> list[float]:
         pairs = zip(excesses, sizes, strict=True)
         return [value if value > _seen(size) * std else 0.0 for (value, std), size in pairs]
     result = []
-    # Few pixels do not tell it: the posterior's mean, of a normal prior with the mean and deviation
-    # that all materials tell together.
+    # Few pixels do not tell a spread: it is the posterior's mean, of a normal prior with the mean
+    # and deviation that all materials tell together.
     for fit in fits:
         value, deviation = fit.excess(usual)
         share = usual**2 / (usual**2 + deviation**2)

@@ -39,10 +39,10 @@ from dbthermal.separation._tiles import Material
 
 NONE: Final = -1  # label of pixels that belong to no material: they are pooled with nobody
 
-# Sizes of the cells, and of those that a mixed cell is cut into [pixel].
+# Sizes of the cells, and of the cells that a mixed cell is cut into [pixel].
 _SPACINGS: Final = (8, 4, 2)
-# False-alarm probability of a step [1]. A link that is refused in error is made
-# elsewhere; one that is made in error bleeds: this is no small number.
+# False-alarm probability of a step [1], not small: a link that is refused in error is made
+# elsewhere, but a link that is made in error bleeds.
 _STEP_RATE: Final = 0.1
 # Probability that two cells without a border are said to hold one [1].
 _BORDER_RATE: Final = 0.01
@@ -169,7 +169,7 @@ def without_borders(labels: xr.DataArray, result: xr.Dataset, response: xr.Datas
     means, variances, stated = (array[:, 0] for array in pooled)
 
     def distance(regions: Labels) -> Array:
-        """Squares of deviations (y, x) by which the own ratios differ from those of cells."""
+        """Squares of deviations (y, x) by which pixels' ratios differ from the cells' ratios."""
         total = ratios.variances + variances[:, regions]
         square = np.sum((ratios.values - means[:, regions]) ** 2 / total, axis=0)
         return np.where(np.all(stated[:, regions], axis=0), square, np.nan)
@@ -186,7 +186,7 @@ def without_borders(labels: xr.DataArray, result: xr.Dataset, response: xr.Datas
 
 
 def others(labels: xr.DataArray, result: xr.Dataset) -> xr.DataArray:
-    """Materials (y, x), and connected pixels of none of them as further labels."""
+    """Materials (y, x), and connected pixels without a material as further labels."""
     telling = int(_UNUSABLE | Status.NO_BACKGROUND_MOTION)  # else it would agree with any
     free = (labels.values < 0) & ((result["status"].values & telling) == 0)
     regions = feature_maps.connected(free.astype(np.intp)) * free
@@ -212,7 +212,7 @@ def joined(
     # A material is cut where ratios of single pixels are biased by what their order leaves of the
     # object; pooled ratios are not.
     merged.join_alike(pairs, _RESOLUTION)
-    # Of a gray region, or one at rest, the ratio is told, and not the emissivity.
+    # A gray or resting region has a ratio, but no emissivity.
     maps, boxes, grown = _features(per_pixel, bands), find_objects(cells), True
     reach = _SPACINGS[0]
     while grown:
@@ -262,12 +262,12 @@ def _bands(result: xr.Dataset, response: xr.Dataset) -> tuple[list[int], Array]:
 
 
 def _sharing(result: xr.Dataset) -> float:
-    """Number of pixels that share an error of their ratios, as those of bands that are blurred."""
+    """Number of pixels that share an error of their ratios, as ratios of blurred bands do."""
     return float(result["reflection_ratio_std"].attrs.get("pixels", 1.0))
 
 
 def _features(result: xr.Dataset, bands: list[int]) -> tuple[Features, Features]:
-    """Ratios of all bands but the reference; and these with the reference's emissivity."""
+    """Ratios of all bands but the reference, without and with the reference's emissivity."""
     ratio, ratio_std, emissivity, emissivity_std = (
         result[name].values[bands].astype(np.float64) for name in _NEEDED[1:5]
     )

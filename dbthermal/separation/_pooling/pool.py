@@ -25,9 +25,9 @@ Surveyor: TypeAlias = Callable[[Inputs, Material | None, Mask], Survey]
 """Surveys some pixels of the image (pixel), alone or with the ratios of their materials."""
 
 Regroup: TypeAlias = Callable[[Material | None], Labels]
-"""Labels (pixel) of materials, of what is told of those before."""
+"""New labels (pixel) of materials, from the estimates of the materials before."""
 
-# Share of a material's pixels that have an emissivity alone, from which it is theirs [1].
+# Share of a material's pixels with an emissivity alone, from which they tell it for all [1].
 _MOST_TOLD: Final = 0.98
 _ROUNDS: Final = 6  # rounds of leaving out pixels that are not of the material
 _INNER: Final = 0.8  # share of its pixels that a ratio needs; by 0.5 objects are 2 % further off
@@ -36,7 +36,7 @@ _MAJORITY: Final = 0.5  # share of pixels with an emissivity alone that speaks f
 _REACH, _SINGLE = 2, 3
 _HARDLY: Final = 0.5  # deviation of a ratio pooled over that alone, from which it hardly helps [1]
 _MOSTLY: Final = 0.5  # share of gray pixels from which their material is [1]
-# Square of the difference in deviations that is no chance, of a pixel and of those around [1].
+# Square of the difference in deviations that is no chance, of a pixel and of its neighbours [1].
 _MORE, _MORE_AROUND = 4.0, 1.5
 # Deviation of the neighbourhood that shares such errors [pixel], and its least weight [1].
 _AROUND, _SOME = 1.5, 1e-3
@@ -121,8 +121,8 @@ def estimate(
 
 
 def _sound(labels: Labels, count: int, survey: Survey, noise: Array) -> tuple[Ratios, Labels, Mask]:
-    """Ratios of each material, labels of the pixels that agree, and those that may be left out."""
-    # A pixel that takes a rapid object for the background has an energy beyond all others'.
+    """Ratios of each material, labels of agreeing pixels, and pixels that may be left out."""
+    # A pixel that takes a rapid object for the background has by far the largest energy.
     measured = np.isfinite(survey.emissivity) * 1.0
     sound = np.where(measured > 0, labels, -1)
     ratio_set = ratios.estimate(sound, count, survey, noise, even=True)
@@ -153,7 +153,7 @@ def _common(
         return common, used
     common, _ = ratios.graded(image, seen, ratio_set, survey, noise, limit=1)
     # Along a gradient pixels far from its middle are no outliers, and the scatters, which are
-    # added, have one axis only if it is taken out. A degree more in each round: pixels near the
+    # added, have one axis only without the gradient. A degree more in each round: pixels near the
     # middle alone would lead astray beyond it.
     for degree in range(2, _ROUNDS + 2):
         local = common.select_pixels(image.surveyed)
@@ -238,7 +238,7 @@ def _graded(
 def regrouped(
     inputs: Inputs, materials: Callable[[Inputs], Material | None], regroup: Regroup | None
 ) -> tuple[Inputs, Material | None]:
-    """Inputs, and what is told of their materials; of others, if that regroups them."""
+    """Inputs, and the estimates of their materials, after a regrouping if the first ask for it."""
     material = materials(inputs)
     labels = None if regroup is None else regroup(material)
     if labels is None or np.all(labels == inputs.labels):
@@ -304,7 +304,7 @@ def hold(
 
 
 def _share(labels: Array, holds: Mask) -> Array:
-    """Share (y, x) of the pixels of each one's material for which something holds; 0 without."""
+    """Share (y, x) of each pixel's material for which a condition holds; 0 without a material."""
     numbers = np.unique(labels, return_inverse=True)[1].ravel()
     share = np.bincount(numbers, holds.ravel()) / np.bincount(numbers)
     return np.where(labels >= 0, share[numbers].reshape(labels.shape), 0.0)

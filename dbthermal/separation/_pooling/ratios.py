@@ -13,7 +13,7 @@ from dbthermal.separation._tiles import Pixels, Survey
 
 _OUTLIER_SIGMAS: Final = 4.0  # deviations beyond which a pixel is not of the material
 _ORDER_SIGMAS: Final = 3.0  # deviations beyond which ratios at two orders differ not by chance
-# Energy along the axis from which there is one: deviations of the noise's, and share of it [1].
+# Least energy along an axis: in deviations of the noise's energy, and as a share of it [1].
 _ENERGY_SIGMAS: Final = 8.0
 _LEAST_ENERGY: Final = 0.01
 
@@ -44,8 +44,8 @@ class Common(Pixels):
     """Ratios of each pixel by its material."""
 
     ratio: Array  # (band, pixel) [1]
-    variance: Array  # of them, common to neighbours (pixel) [1/K^2]
-    spread: Array  # of single pixels about them (pixel) [1/K^2]
+    variance: Array  # of the ratios, common to neighbours (pixel) [1/K^2]
+    spread: Array  # of single pixels about the ratios (pixel) [1/K^2]
 
 
 def total(labels: Labels, values: Array, count: int) -> Array:
@@ -60,10 +60,10 @@ class Ratios:
 
     ratio: Array  # (band, material) [1]
     variance: Array  # (material) [1/K^2]
-    rapid: Mask  # at the largest order, not at those of the pixels (material)
+    rapid: Mask  # ratio taken at the largest order, not at the pixels' orders (material)
 
     def common(self, labels: Labels) -> Common:
-        """Ratios of pixels of given labels (pixel,), as far as they have one."""
+        """Ratios of pixels by their labels (pixel,)."""
         return Common(self.ratio[:, labels], self.variance[labels], np.zeros(labels.size))
 
 

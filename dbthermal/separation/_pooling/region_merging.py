@@ -49,7 +49,7 @@ class Features:
 
 
 def mixed(cells: Labels, features: Features, error_rate: float) -> Mask:
-    r"""Cells (cell + 1,) whose pixels do not agree; of one material at most at the error rate.
+    r"""Cells (cell + 1,) whose pixels disagree; cells of one material only at the error rate.
 
     .. math:: \sum_p (f_p - \bar f)^2 / s_p^2 > \chi^2_{n - 1}(1 - \alpha / \mathrm{cells})
     """
@@ -105,7 +105,7 @@ class Regions:
         return cell
 
     def roots(self) -> Labels:
-        """Roots (cell + 1,) of all cells, that of no cell first."""
+        """Roots (cell + 1,) of all cells; the root of pixels without a cell comes first."""
         while np.any(self._parent != self._parent[self._parent]):
             self._parent = self._parent[self._parent]
         return self._parent.copy()
@@ -170,7 +170,7 @@ class Regions:
         return self._first[:, regions] / safe, pixels / safe, valid
 
     def _compare_one(self, first: int, second: int) -> tuple[float, float]:
-        """As `compare` of one pair: without arrays, for there are many."""
+        """Compare a pair of regions, as `compare` does, without arrays: there are many pairs."""
         statistic, features, resolution = 0.0, 0, np.inf
         for k, (total, sums) in enumerate(zip(self._total, self._first, strict=True)):
             if total[first] > 0 and total[second] > 0:

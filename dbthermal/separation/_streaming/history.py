@@ -17,12 +17,12 @@ from dbthermal.separation._subspace.method import METHOD, separate_smooth
 
 Threads = Callable[[Callable[[Any], None], Iterable[Any]], None]
 
-_SAMPLES: Final = 128  # at most; half of them at least, once they were as many
+_SAMPLES: Final = 128  # at most; once reached, half of them at least
 _TOGETHER: Final = 4  # tiles of pixels that a thread separates at once
 
 
 class History:
-    """Samples of both bands, each a mean of frames, and the maps of the pixels by them."""
+    """Samples of both bands, each a mean of frames, and the maps of each pixel from the samples."""
 
     def __init__(
         self, inputs: Inputs, status: Bits, gain: Planes, frames: int, timing: tuple[float, ...]

@@ -50,7 +50,7 @@ class Camera(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """Local polynomials over the means around one, from the narrowest to the widest."""
+    """Local polynomials over the means around a mean, from the narrowest to the widest."""
 
     weights: npt.NDArray[np.float64]  # of the means in value and slope (fit, 2, mean) [1, 1/s]
     ends: npt.NDArray[np.intp]  # first mean that has a weight, and the first after (fit, 2)
@@ -73,7 +73,7 @@ def camera(inputs: Inputs) -> tuple[Camera, Camera]:
 
 
 def _single(record: Any) -> Any:
-    """Record of numbers, and of tuples of them, in single precision."""
+    """Record of numbers and tuples of numbers in single precision."""
     if not isinstance(record, tuple):
         return np.float32(record) if isinstance(record, float) else record
     numbers = [_single(number) for number in record]
@@ -104,8 +104,8 @@ class Block(NamedTuple):
     """Frames of one mean, the maps of their pixels, and their temperatures."""
 
     frames: Planes  # (band, frame, y, x) [count]
-    means: Planes  # around them (mean, band, y, x) [count]
-    order: npt.NDArray[np.intp]  # places of these, by time
+    means: Planes  # around the frames (mean, band, y, x) [count]
+    order: npt.NDArray[np.intp]  # places of the means, by time
     maps: Planes  # ratio, its variance, emissivities, elements of their covariance (map, y, x)
     gain: Planes  # noise of the second band over that of a frame (y, x)
     status: npt.NDArray[np.uint32]  # (y, x)

@@ -274,10 +274,10 @@ def _pattern(model: Model, work: Work) -> None:
 
 @inlined
 def judge(model: Model, work: Work, record: Any, sums: Array) -> None:
-    """Is the null residual noise? And its sums over blocks, with those of the object's curve."""
+    """Judge if the null residual is noise; sums of it and of the object's curve over blocks."""
     residual, rapid, coefficients = work.null_residual, work.rapid, work.coefficients
     count, w, frames = record.order + model.steps, work.null_weights, work.first.size
-    if model.stepless:  # the smooth curves of the object are those of the signals
+    if model.stepless:  # object and signals have the same smooth functions
         kernels.copy(work.target, residual)
     else:
         combined(w, coefficients, count, work.columns)

@@ -34,7 +34,7 @@ class Tree(NamedTuple):
 
     edges: Whole  # first frames of each piece, and the last one's end (piece, 2)
     columns: Whole  # number of its functions (piece)
-    chosen: Whole  # of these, by which is chosen (piece)
+    chosen: Whole  # number of functions by which pieces are chosen (piece)
     places: Whole  # of its first function among the values (piece)
     values: Array  # of functions: at the frames, or their products with those of both halves
     held: Whole  # of its first product among those of a pixel, and the last one's end (piece)
@@ -56,7 +56,7 @@ class Scratch(NamedTuple):
     least: Array  # cost of the best division of each piece (piece, axis)
     joined: joining.Scratch
     reached: Whole  # pieces whose halves may be used
-    axis: Array  # the same of one axis
+    axis: Array  # axes, weights and costs as above, of a single axis
     weight: Array
     cheapest: Array
     taken: Array  # axes of divisions (division, 2), costs, and the frames that pieces begin with
@@ -333,7 +333,7 @@ def _pixel(tree: Tree, scratch: Scratch, white: Array, axis: Array, begins: Mask
 
 @compiled
 def _near(axis: Array, taken: Array, count: int, angle: float) -> bool:
-    """Compare an axis with those that are taken: is it within an angle [rad] of one."""
+    """Say whether an axis lies within an angle [rad] of an axis that is taken."""
     near = False
     for i in range(count):
         product = abs(axis[0] * taken[i, 0] + axis[1] * taken[i, 1])

@@ -87,7 +87,7 @@ class Solution(Pixels):
 def _film(
     temperature: Array, variance: Array, model: Model, value: Any, std: Any
 ) -> tuple[Any, Any, Any]:
-    """A temperature and its deviation, NaN where useless; and what is wrong with them."""
+    """Temperature and deviation (time), NaN where useless; numbers lost, missing, out of range."""
     lost, missing, beyond, zero, unit = _ZERO, _ZERO, _ZERO, _ZERO, _ONE
     lowest, highest = np.float32(model.lowest), np.float32(model.highest)
     for t in range(temperature.size):

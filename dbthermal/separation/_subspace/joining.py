@@ -1,4 +1,4 @@
-r"""Pieces of time that are joined with those beside them, of one pixel, compiled.
+r"""Pieces of time that are joined with adjacent pieces, of one pixel, compiled.
 
 Halving makes more pieces than are needed: a change at a third of the time needs many. Of the ends
 of pieces at hand the best are found by going through them in their order. A signal is summed up in

@@ -1,7 +1,4 @@
-"""Pieces of time for an object that changes rapidly: which pixels ask for them, and their outcome.
-
-Which are best is found in `division`.
-"""
+"""Pieces of time for an object that changes rapidly: which pixels need them; see `division`."""
 
 from collections.abc import Iterable
 from functools import lru_cache
@@ -28,8 +25,8 @@ STARTS: Final = (0, 2, 3, 4, 5)
 ROUNDS: Final = 4
 # Axes that are refined, of which the two best are kept: joined, they may change places.
 AXES: Final = 4
-# Costs that differ by less are the same but for rounding: of two divisions the finer one is taken,
-# whose pieces may be joined, and of two ways to join pieces that of the longest.
+# Costs that differ by less are the same but for rounding: of two divisions the finer is taken,
+# whose pieces may be joined, and of two ways to join pieces the one with the longest pieces.
 TIE: Final = 1e-6
 APART: Final = 6.0  # standard deviations between two axes that are told apart
 
@@ -163,7 +160,7 @@ def sudden(curve: Array, std: Array, time: Array) -> Mask:
     # By more than its deviations, and not over a pause.
     jumps = (step > bars.CHANGE * noise) & (interval < 2.0 * usual)[:, np.newaxis]
     result = np.any(jumps, axis=0)
-    jumping, size = curve[:, result], (frames, 1)  # of the others the surroundings say nothing
+    jumping, size = curve[:, result], (frames, 1)  # smooth pixels need no surroundings
     change_around = maximum_filter(jumping, size)[1:] - minimum_filter(jumping, size)[1:]
     # By more than most of its change within a second.
     result[result] = np.any(jumps[:, result] & (step[:, result] > _MOST * change_around), axis=0)

@@ -32,8 +32,8 @@ class Model(NamedTuple):
     object_part: Array  # (column, time)
     spans: Whole  # first frames of these functions, and the ends (column, 2)
     rising: Array  # (degree, time)
-    whole: Whole  # of these (degree, 2)
-    spread: float  # of the first of these
+    whole: Whole  # first frames of the rising functions, and the ends (degree, 2)
+    spread: float  # range of the first rising function
     leverage: Array  # (order, time)
     steps: int
     stepless: bool  # no function has a step of the camera: both are the same
@@ -50,7 +50,7 @@ class Model(NamedTuple):
 
 
 class Work(NamedTuple):
-    """Signals and curves (time) of one pixel, and of some as they are read and written."""
+    """Signals and curves (time) of one pixel, and blocks of pixels that are read and written."""
 
     first: Array  # signal of the first band [K]
     target: Array  # null combination of the bands, smoothed (eq. 5)
@@ -267,7 +267,7 @@ def may_be_gray(model: Model, record: Any, work: Work) -> bool:
 
 @inlined
 def _chance(statistic: float, freedom: int) -> float:
-    """Chance of a larger chi-square: of two degrees of freedom less, and one more term."""
+    """Chance of a larger chi-square, as a sum of terms that add two degrees of freedom each."""
     half, odd = 0.5 * statistic, freedom % 2
     chance, power = erfc(sqrt(half)) if odd else exp(-half), 0.5 if odd else 1.0
     term = exp(-half) * (2.0 * sqrt(half / np.pi) if odd else half)

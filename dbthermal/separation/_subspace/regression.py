@@ -21,7 +21,7 @@ ANNEALING: Final = 0.7
 STARTING_STEPS: Final = 5
 STARTING_POINTS: Final = 128
 STEPS: Final = 3
-# Largest correlation of neighbouring residuals: that of one all slow would be 1.
+# Largest correlation of neighbouring residuals: a wholly slow residual would have 1.
 MOST_CORRELATED: Final = 0.98
 _GUESSES: Final = 60  # of the value of a rank, at most
 
@@ -29,7 +29,7 @@ _GUESSES: Final = 60  # of the value of a rank, at most
 @compiled
 def ranked(values: npt.NDArray[np.float32], rank: int, guess: float) -> float:
     """Value of a rank, from 0, of values that are not negative, from a guess: no sorting."""
-    # As whole numbers these bits are in the same order, and NaN above all.
+    # The bits of such values, as whole numbers, are in the same order, and NaN above all.
     bits = values.view(np.uint32)
     least, most = np.float32(0.0), np.float32(values.size)
     low, high = np.float32(0.0), np.float32(np.inf)
@@ -50,7 +50,7 @@ def ranked(values: npt.NDArray[np.float32], rank: int, guess: float) -> float:
         elif turn % 3 == 2:
             middle = np.float32(0.5) * (low + high)
         else:
-            # Interpolated between the numbers of values below two others.
+            # Interpolated between the numbers of values below two bounds.
             share = (goal + np.float32(0.5) - least) / (most - least)
             middle = low + share * (high - low)
         if not low < middle < high:
@@ -125,8 +125,8 @@ def _started(x: Array, y: Array, noise: float, few: Any) -> tuple[float, float]:
         plain[i] = ys[i] - intercept - slope * xs[i]
     rank, zero = int(SHARE * count), np.float32(0.0)
     best, best_slope, best_intercept = np.inf, np.inf, np.inf
-    # Disturbances of a resting background lie mostly on one side of it: one of the halves is then
-    # nearly free of them. The start with the smallest deviation wins.
+    # Disturbances of a resting background lie mostly on one side of it: half of the points is
+    # then nearly free of disturbances. The start with the smallest deviation wins.
     for start in range(3):
         sign = np.float32(2 * start - 3) if start > 0 else zero
         for i in range(count):
