@@ -33,8 +33,8 @@ _UNSOLVED: Final = 1e-2
 # A place so far outside of the image is still at its border, as a shift that is known may be off by
 # so much [pixel].
 _OUTSIDE: Final = 0.2
-_LOST_WEIGHT: Final = 0.25  # weight of pixels without a value that the others may take over [1]
-# Share of the pixels of some rows up to which they are read one by one: a shift that is as wide as
+_LOST_WEIGHT: Final = 0.25  # weight of pixels without a value that good pixels may take over [1]
+# Share of the pixels of some rows up to which pixels are read singly: a shift that is as wide as
 # an image is high leaves most of them without a weight [1].
 _FEW: Final = 0.5
 _NO_WEIGHT: Final = 1e-3  # weight below which a pixel's flags do not count [1]
@@ -44,7 +44,7 @@ _KEPT: Final = 2**29
 
 T = TypeVar("T")
 Paired: TypeAlias = tuple[Array, Mask, Mask, Bits, Array]
-"""Counts, samples valid or bridged, those that are valid, status, and noise: see `read`."""
+"""Counts, samples valid or bridged, valid samples, status, and noise: see `read`."""
 
 
 class Resampled(NamedTuple):
@@ -53,7 +53,7 @@ class Resampled(NamedTuple):
     counts: npt.NDArray[np.float32]  # of its bands (band, time, pixel) [count]
     packed: npt.NDArray[np.uint8] | None  # bits of samples that are valid (time, pixel); None: all
     status: Bits  # (pixel)
-    gain: Array  # noise (first band and others, pixel) [1] over that of a sample
+    gain: Array  # noise over a sample's (first band and second camera, pixel) [1]
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Displacement:
         return result
 
     def source(self, rows: slice) -> slice:
-        """Rows of the image that hold some rows, and what the second camera shows of them."""
+        """Rows of the image that hold some rows, and the second camera's samples for these rows."""
         width = self.shape[1]
         first, last = self.resample.indptr[[rows.start * width, rows.stop * width]]
         used = self.resample.indices[first:last] // width
@@ -86,7 +86,7 @@ class Displacement:
         return slice(min(rows.start, int(used.min())), max(rows.stop, int(used.max()) + 1))
 
     def weights(self, rows: slice, source: slice) -> csr_array:
-        """Weights of the pixels of some rows of the source, for those of some rows."""
+        """Weights of the source's pixels at the pixels of some rows."""
         width = self.shape[1]
         pixels, around = (slice(span.start * width, span.stop * width) for span in (rows, source))
         return csr_array(self.resample[pixels, around])
@@ -192,10 +192,8 @@ def paired(
     selected: slice | npt.NDArray[np.intp],
     fewest: int,
 ) -> Paired:
-    """Some pixels of some rows of a capture as `read`, their short gaps bridged.
-
-    The source is read if these rows are not kept: the others' samples are, in single precision.
-    """
+    """Read some pixels of some rows as `read` does, their short gaps bridged."""
+    # Samples of the second camera are kept, in single precision: a source is not read again.
     kept, place, bands = displacement.kept, (rows.start, rows.stop), capture.sizes["band"]
     resampled = kept.get(place)
     if resampled is None:
@@ -232,11 +230,8 @@ def read(
     fewest: int,
     grains: list[samples.Grain],
 ) -> tuple[Array, Mask, Bits, Array]:
-    """Read some rows of the reference band, and what the others show of the same reflections.
-
-    Of the block, the rows of the `source`, which hold those of `displacement.source(rows)`. As
-    `quality.read`; and the noise (first band and others, pixel) [1] over that of a sample.
-    """
+    """Read rows of both cameras with the same reflections, and their noise over a sample's [1]."""
+    # The block has the rows of the `source`, which hold those of `displacement.source(rows)`.
     reference, second_bands = displacement.reference, displacement.others
     needed = displacement.source(rows)
     inner = slice(rows.start - source.start, rows.stop - source.start)
@@ -280,7 +275,7 @@ def read(
 
 
 def _used(weights: csr_array, rows: slice) -> tuple[Any, dict[str, Any]]:
-    """Pixels of some rows that have a weight, if few; and the places of those that are read."""
+    """Pixels of some rows that have a weight, if few; and the places of the pixels to read."""
     used, pixels = np.unique(weights.indices), weights.shape[1]
     if used.size > _FEW * pixels:
         return slice(None), {"y": rows}
@@ -290,11 +285,9 @@ def _used(weights: csr_array, rows: slice) -> tuple[Any, dict[str, Any]]:
 
 
 def without(weights: csr_array, bad: Mask, width: int) -> csr_array:
-    """Weights without the bad pixels, whose part the others take over; a plane stays one.
-
-    Where that part is large the weights stay as they are.
-    """
+    """Weights of the good pixels, which take over the bad pixels' part; a plane stays a plane."""
     lost = abs(weights) @ bad
+    # Where the part of bad pixels is large the weights stay as they are.
     rows = np.flatnonzero((lost > 0) & (lost <= _LOST_WEIGHT))
     if rows.size == 0:
         return weights
@@ -307,7 +300,7 @@ def without(weights: csr_array, bad: Mask, width: int) -> csr_array:
     plane = np.stack([np.ones(pixels.shape), *np.divmod(pixels, width)])
     size = np.abs(values)
     plane[1:] -= ((plane[1:] * size).sum(axis=-1) / size.sum(axis=-1))[..., np.newaxis]
-    # The smallest change of the others with the same sums over it.
+    # The smallest change of the good pixels' weights with the same sums over the plane.
     off = bad[pixels]
     kept, missing = np.where(off | (place >= count), 0.0, plane), np.where(off, plane * values, 0.0)
     change = np.linalg.pinv(np.moveaxis(kept, 0, 1)) @ missing.sum(axis=-1).T[..., np.newaxis]

@@ -67,17 +67,14 @@ class Equations:
         return result
 
     def solve(self, target: Floats, start: Floats, change: Floats) -> tuple[Floats, Floats, Floats]:
-        """Solve for u_1(x(r)) and u_1(x(p)) (pixel, frame) [K], of a target q and from a start.
-
-        The `change` (loose, frame) [K] is e_1 [u_1(x(p)) - u_1(x(r))] where it is known
-        beforehand. Also returns the last step (pixel) [K].
-        """
+        """Solve for u_1(x(r)) and u_1(x(p)) (pixel, frame) [K]; and the last step (pixel) [K]."""
         way, place = np.zeros((2, self.first.size), dtype=np.intp)
         for number, pixels in enumerate(self.ways):
             way[pixels], place[pixels] = number, np.arange(pixels.size)
         matrices = self.there, self.onward
         there, onward = ((matrix.indptr, matrix.indices, matrix.data) for matrix in matrices)
         beyond = np.ascontiguousarray((self.onward @ self.shares[1:].T).T)
+        # The known change (loose, frame) [K] is e_1 [u_1(x(p)) - u_1(x(r))].
         moved = np.asarray(change / self.first[self.ways[relaxation.LOOSE], np.newaxis], np.float32)
         terms = relaxation.Terms(self.shares, self.bends, way, place, there, onward, beyond, moved)
         target, signal = (np.array(film, np.float32, order="C") for film in (target, start))
@@ -105,7 +102,7 @@ def ratio_of(emissivity: Floats) -> Floats:
 
 
 def inside(emissivity: Floats) -> Floats:
-    """Emissivities of the same ratios, none of them outside or at the end of (0, 1)."""
+    """Emissivities of the same ratios, all of them well inside (0, 1)."""
     ratio = ratio_of(emissivity)
     # e_m > 0 leaves 0 < 1 - e_1 < 1 / kappa.
     most = 1.0 / np.maximum(ratio.max(axis=0), 1.0)
@@ -120,7 +117,7 @@ def weights(inputs: Inputs, emissivity: Floats) -> Floats:
 
 
 def of_ratio(inputs: Inputs, material: Material) -> Floats:
-    """Variance (pixel) [1] of the first weight by that of a material's ratios, 0 without one."""
+    """Variance (pixel) [1] of the first weight by the material's ratios, 0 without a material."""
     noise = inputs.noise[inputs.bands]
     std = np.sqrt(ratio_variance(material.ratio, material.inverse_energy, noise))
     ratios = material.ratio, material.ratio + std
@@ -182,12 +179,10 @@ def bends(curves: tuple[Curve, ...]) -> Floats:
 
 
 def of_material(inputs: Inputs, raw: Floats, material: Material) -> tuple[Floats, Mask]:
-    """Emissivities (band, pixel) [1] of each pixel's material; and where that tells them.
-
-    Not beside a gray body, which has no combination without background.
-    """
+    """Emissivities (band, pixel) [1] of each pixel's material, and the pixels where they hold."""
     ratio = np.where(np.isfinite(material.ratio), material.ratio, ratio_of(raw))
     variance = null_combination(ratio, inputs.noise[inputs.bands])[1]
+    # Not beside a gray body, which has no combination without background.
     sharp = material.inverse_energy * variance < 1.0 / chdtri(len(raw) - 1, reflection_ratio.CHANCE)
     ratio = np.where(sharp, ratio, ratio_of(raw))
     first = np.where(np.isfinite(material.emissivity) & sharp, material.emissivity, raw[0])
@@ -216,11 +211,9 @@ class Change:
 
 
 def samples(inputs: Inputs, frames: Whole) -> tuple[Floats, Floats]:
-    """Signal (frame, pixel) [K] of the reference band, and the steps of the camera in it.
-
-    A sample that is no measurement is 0, an outlier of the regression.
-    """
+    """Signal (frame, pixel) [K] of the reference band, and the steps of the camera in it."""
     functions, width = smooth_functions(inputs.capture), inputs.capture.sizes["x"]
+    # A sample that is no measurement is 0, an outlier of the regression.
     first = np.nan_to_num(_signal(inputs, time=frames)).reshape(frames.size, -1)
     steps = np.zeros_like(first)
     if functions.steps:
@@ -232,12 +225,7 @@ def samples(inputs: Inputs, frames: Whole) -> tuple[Floats, Floats]:
 
 
 def change(inputs: Inputs, loose: Whole, result: xr.Dataset, threads: Executor) -> Change:
-    """Change of the reference band's signal to p of loose pixels, smoothed over time.
-
-    So smoothed it is that of e_1 u_1(x) and holds little of that of the reflection. Bad pixels have
-    no part in it. Where p has another ratio than r it may be of another material, whose signal is
-    another: then what the change from the other side of r differs by is in the deviation.
-    """
+    """Change of the reference band's signal from r to p of loose pixels, smoothed over time."""
     displacement = inputs.displacement
     assert displacement is not None
     functions = smooth_functions(inputs.capture)
@@ -249,6 +237,8 @@ def change(inputs: Inputs, loose: Whole, result: xr.Dataset, threads: Executor) 
     ratio, std = (result[name].values[second].ravel() for name in names)
     nearest = abs(at_p).argmax(axis=1)
     variance = (std[nearest] ** 2 + std[loose] ** 2) * chdtri(1, reflection_ratio.CHANCE)
+    # Where p has another ratio than r it may be of another material, with another signal: the
+    # deviation then holds the difference to the change from the other side of r.
     unlike = ~unknown & ((ratio[nearest] - ratio[loose]) ** 2 > variance)
     unlike &= (abs(across) @ bad == 0.0) & (across.sum(axis=1) > 0.0)
     # Only the pixels that they are made of are read.
@@ -258,6 +248,7 @@ def change(inputs: Inputs, loose: Whole, result: xr.Dataset, threads: Executor) 
     moved = at_p[:, pixels] @ film - at_r
     bend = moved + across[:, pixels] @ film - at_r
     moved[unknown] = 0.0
+    # Smoothed, it is the change of e_1 u_1(x) and holds little of the reflection's change.
     curves = moved @ functions.functions
     error = moved - curves @ functions.functions.T
     energy, lagged = (error**2).sum(axis=1), (error[:, 1:] * error[:, :-1]).sum(axis=1)

@@ -62,7 +62,7 @@ _GROWN: Final = 1e3
 
 @dataclass(frozen=True)
 class Frames:
-    """Frames at which a film is solved: a few of one that is smooth, else all."""
+    """Frames at which a film is solved: a few of a smooth film, else all."""
 
     nodes: Whole  # (node)
     weights: Floats | None  # of the nodes in each frame (frame, node); None of all frames
@@ -75,20 +75,17 @@ class Frames:
     @classmethod
     @np.errstate(invalid="ignore", divide="ignore")
     def of(cls, result: xr.Dataset) -> "Frames":
-        """Frames that tell the object of a result.
-
-        Polynomials through nodes that lie close together near the ends, as Chebyshev's do, repeat a
-        film that is one of them. Where they are off by more than a share of its deviation, in more
-        than a few of the samples, the object changes rapidly.
-        """
+        """Frames at which a result's object is solved: few if it changes smoothly, else all."""
         film, std = (result[name].values.reshape(result.sizes["time"], -1) for name in _OBJECT)
         time, every = result["time"].values, np.arange(len(film))
         functions = smooth.largest(time).functions
         count = _NODES * functions.shape[1]
+        # Polynomials through nodes close together near the ends (Chebyshev) repeat a smooth film.
         place = 0.5 * (1.0 - np.cos(np.pi * (np.arange(count) + 0.5) / count)) * np.ptp(time)
         nodes = np.unique(np.abs(time - time[0] - place[:, np.newaxis]).argmin(axis=1))
         weights = np.asarray(functions @ np.linalg.pinv(functions[nodes]), np.float32)
         sampled = looked_at(time.size)
+        # Off by more than a share of the deviation, in more than a few samples: a rapid object.
         off = np.abs(weights[sampled] @ film[nodes] - film[sampled]) / std[sampled]
         if nodes.size == time.size or not _most(off) < _NO_MATTER:
             return cls(every, None)
@@ -96,7 +93,7 @@ class Frames:
 
 
 def _most(values: Floats) -> float:
-    """Value that all but a few of those that are numbers do not exceed; NaN of none."""
+    """Value that all but a few of the finite values do not exceed; NaN without such values."""
     numbers = values[np.isfinite(values)]
     return float(np.quantile(numbers, _MOST)) if numbers.size else np.nan
 
@@ -157,7 +154,7 @@ class Joint:
             gaussian_filter1d(curves, 1.0, axis=axis, order=1) * component.astype(np.float32)
             for axis, component in zip((1, 2), off, strict=True)
         ]
-        # Without a solution x(p) was taken for x(r): they differ as those nearest do.
+        # Without a solution x(p) was taken for x(r): they differ as at the nearest solution.
         unsolved = np.isnan(self.signals[0]).all(axis=0).reshape(status.shape)
         near = distance_transform_edt(unsolved, return_distances=False, return_indices=True)
         square = np.mean((self.signals[1] - self.signals[0]) ** 2, axis=0).reshape(status.shape)
@@ -191,12 +188,7 @@ def solve(
     before: Joint | None = None,
     blur: float = 0.0,
 ) -> Joint | None:
-    """Solve the equations of all pixels, from a result that takes x(p) for x(r).
-
-    Or from one of inputs with the difference of a solution `before`. Of an object that changes
-    smoothly the combination without background is that of the `maps`, at the ratios of a material,
-    else that of the result. None where the object hardly differs between the two places.
-    """
+    """Solve the object of all pixels at both cameras' places; None if it hardly differs there."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         maps = maps if frames.smooth else None
         raw, variance, solved = _solvable(inputs, result, maps, material)
@@ -206,6 +198,8 @@ def solve(
         places = equations.solved
         change = system.change(inputs, equations.ways[relaxation.LOOSE], result, threads)
         shares = system.coefficients(inputs, raw, solved)[:, places]
+        # Of a smooth object the combination without background is that of the maps, at a material's
+        # ratios; else that of the result, which takes x(p) for x(r) or holds `before`.
         if maps is not None:
             target, size = _by_maps(inputs, maps, raw, material, result, places)
         else:
@@ -236,7 +230,7 @@ def solve(
         films, step = objects_at(sampled, equations, start)
         if not _most(np.abs(shares[1:].sum(axis=0) * (films[1] - films[0])) / size) > _MATTERS:
             return None
-        # The emissivities, if they are not those of a material.
+        # The emissivities, unless a material states them.
         emissivity = system.inside(raw)
         of_slope: Floats = np.zeros(solved.size)
         of_ratio: Floats = np.zeros(solved.size)
@@ -299,14 +293,12 @@ def _by_maps(
     result: xr.Dataset,
     places: Whole,
 ) -> tuple[Target, Floats]:
-    """Combination of the maps, and its deviation (solved) [K].
-
-    That of the noise and, of ratios of single pixels, of these.
-    """
+    """Combination without background from the maps, and its deviation (solved) [K]."""
     noise = inputs.noise[inputs.bands]
     ratio = system.ratio_of(raw)[:, places].astype(np.float64)
     weights = null_combination(ratio, noise)[0]
     combined, variance = maps.combined(weights, places)
+    # Ratios of single pixels add their deviation to that of the noise.
     if material is not None:
         std = result["reflection_ratio_std"].values[inputs.bands].reshape(len(noise), -1)[:, places]
         size = np.sqrt(noise[:, np.newaxis] ** 2 + (ratio * noise[0]) ** 2)  # eq. 4
@@ -338,7 +330,7 @@ def _by_film(
     frames, places = result.sizes["time"], equations.solved
     film, stds = (result[name].values.reshape(frames, -1) for name in _OBJECT)
     stds = stds[looked_at(frames)][:, places]
-    # In units of the deviation or, of a method without one, of the noise.
+    # In units of the deviation or, of a method without deviations, of the noise.
     stds = np.where(np.isfinite(stds), stds, inputs.noise.min())
     film = smooth.bridge(copied(film), np.isin(np.arange(film.shape[1]), places))
     weights, curve = system.weights(inputs, raw)[1:, places], inputs.curves[inputs.bands[0]]
@@ -367,7 +359,7 @@ def _emissivities(
     band: tuple[Floats, Floats],
     threads: Executor,
 ) -> tuple[system.Equations, Floats, Floats]:
-    """Equations of the emissivities of the object at its own place, these, and e_1's variance."""
+    """Equations and emissivities of the object at its own place, and the variance of e_1."""
     emissivity, noise = system.inside(raw), inputs.noise[inputs.bands[0]]
     measured = np.isfinite(result["emissivity"].values[inputs.bands[0]].ravel())
     solved, step = equations.spread(np.ones(films.shape[2], dtype=bool)), np.zeros(len(raw[0]))
@@ -400,11 +392,8 @@ def _emissivities(
 def _emission(
     films: Floats, band: tuple[Floats, Floats], emissivity: Floats, noise: float, few: slice
 ) -> tuple[Floats, Floats, Mask]:
-    """Emissivity of the first band as its slope over the object, its variance, and where it holds.
-
-    Of a few pixels, by the object's signals at both places (2, frame, solved), and those of the
-    band and the steps of the camera in it (frame, solved).
-    """
+    """Emissivity of the first band as its slope over the object, its variance, and its validity."""
+    # Object at both places (2, frame, solved) [K]; band: signal, steps of the camera in it [K].
     signal, at_p = films[..., few].astype(np.float64)
     slope, variance, energy, kernel = regression.lines(signal, band[0][:, few], noise)
     # A gradient as steep as the object's own change turns the step round: divide by it.
@@ -426,14 +415,11 @@ def _factor(
     blur: float,
     threads: Executor,
 ) -> Floats:
-    """Variance (pixel) [1] of the object over that of a pixel alone, by draws; NaN where unsettled.
-
-    The `std` (2, pixel) [K] is that of a pixel alone, and of its target through the emissivity; the
-    `variance` (loose) [K^2] that of the change.
-    """
+    """Variance of the object over that of a pixel alone (pixel) [1], by draws; NaN if unsettled."""
     displacement = inputs.displacement
     assert displacement is not None
     rng = np.random.default_rng(inputs.seed)
+    # Deviations of a pixel alone, and of its target through the emissivity (pixel) [K].
     size, off = std[..., np.newaxis]
     # Errors of single pixels, of the drawn noise scaled to their deviations.
     drawn = displacement.resample @ rng.standard_normal((size.size, _DRAWS))

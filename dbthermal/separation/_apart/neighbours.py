@@ -40,7 +40,7 @@ SHARING: Final = 4.0 * np.pi * BLUR**2
 """Pixels that share an error of such a ratio: the inverse sum of the blur's squared weights."""
 
 BLURS: Final = (0.0, BLUR, 2.0 * BLUR)
-"""Those of a material, each wider than the one before."""
+"""Deviations of the blurs of a material, rising [pixel]."""
 
 # Deviation of the neighbourhood in which ratios are compared: that of a field and its data [pixel].
 _WIDE: Final = 6.0
@@ -57,12 +57,7 @@ _AROUND: Final = 0.125
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def ratios(inputs: Inputs, planes: Planes, status: Bits) -> Material:
-    """Ratios (band, pixel) of bands blurred alike, as those of each pixel's own material.
-
-    Their variance is times the reduced chi-square about the median of those around. A pixel whose
-    model does not hold takes that median, with the variance of the ratios around beside it. At the
-    border of a material, where a blur mixes two, a pixel has the ratio of its sharp bands.
-    """
+    """Ratios (band, pixel) of bands blurred alike, as those of each pixel's own material."""
     noise, shape = inputs.noise[inputs.bands], (len(inputs.bands), *status.shape)
     blurred, sharp = planes.scatters(BLUR), planes.scatters(0.0)
     ratio, border = (scatters.ratio.reshape(shape) for scatters in (blurred, sharp))
@@ -85,6 +80,8 @@ def ratios(inputs: Inputs, planes: Planes, status: Bits) -> Material:
     square = (ratio - middle) ** 2
     chi = neighbour_mean((square * weight)[1:].mean(axis=0), sound, _WIDE)
     between = neighbour_mean(square, weight, _WIDE)
+    # At a border, where a blur mixes two materials, the sharp bands' ratio; where the model does
+    # not hold, the median around, with the variance of the ratios around beside it.
     cases = [mixed, sound, moving & (gaussian_filter(sound * 1.0, _WIDE, mode="constant") > _SOME)]
     ratio = np.select(cases, [border, ratio, middle], np.nan)
     variance = np.select(cases, [of_border * usual, variance * np.maximum(chi, 1.0), between])
@@ -101,18 +98,14 @@ def materials(
     per_pixel: xr.Dataset,
     pooled: Callable[..., Material | None],
 ) -> Material | None:
-    """Ratios and emissivity as of `pool.materials`, the ratios of bands that are blurred alike.
-
-    Of the pixels that no neighbour's blur reaches. Their variance is that between windows of the
-    image, and what the blurs have changed, which may be as much again beyond them. A material too
-    narrow for a blur has that of the others.
-    """
+    """Ratios and emissivity as of `pool.materials`, the ratios of bands that are blurred alike."""
     assert inputs.labels is not None
     noise, shape = inputs.noise[inputs.bands], per_pixel["status"].shape
     labels, material, sharp = inputs.labels.reshape(shape), None, None
     between = np.zeros(inputs.labels.size)
     for blur, scatter in scatters.items():
         size = 1 + 2 * int(np.ceil(TAIL * blur))
+        # Pixels that no neighbour's blur reaches.
         inner = minimum_filter(labels, size) == maximum_filter(labels, size)
         selected = pool.select(np.where(inner.ravel() & scatter.usable, inputs.labels, -1))
         places = np.flatnonzero(selected)
@@ -127,6 +120,7 @@ def materials(
     if material is None:
         return None
     # A pixel's own ratio is that of bands blurred differently: it does not make this more certain.
+    # The variance is that between windows of the image, and what the blurs have changed.
     variance = material.inverse_energy + material.spread + between
     none = np.zeros_like(variance)
     material = replace(material, inverse_energy=variance, spread=none)
@@ -136,7 +130,7 @@ def materials(
 def _survey(
     scatters: Scatters, per_pixel: xr.Dataset, noise: Array, places: npt.NDArray[np.intp]
 ) -> Survey:
-    """Survey of some pixels by their planes; of those of a sound model."""
+    """Survey of some pixels by their planes, without scatter where the model is not sound."""
     status = per_pixel["status"].values.ravel()[places]
     emissivity = per_pixel["emissivity"].sel(band=per_pixel.attrs["reference_band"]).values
     value = np.where(status == 0, emissivity.ravel()[places], np.nan)
@@ -156,11 +150,8 @@ def _survey(
 
 
 def _between_windows(image: Image, survey: Survey, noise: Array, shape: tuple[int, ...]) -> Array:
-    """Variance (material) [1/K^2] of ratios by the jackknife over windows; NaN of too few of them.
-
-    A window is wider than the nodes of the shift's field, whose errors its pixels share. For few
-    of them it is widened as the interval of 95 % is, by Student's t.
-    """
+    """Variance (material) [1/K^2] of ratios by the jackknife over windows; NaN of few windows."""
+    # A window is wider than the nodes of the shift's field, whose errors its pixels share.
     side = -(-min(shape) // _ALONG)
     row, column = np.divmod(image.surveyed, shape[1])
     labels, windows = image.labels[image.surveyed], row // side * shape[1] + column // side
@@ -174,6 +165,7 @@ def _between_windows(image: Image, survey: Survey, noise: Array, shape: tuple[in
         np.add.at(scatters, number, np.moveaxis(survey.scatter[0][..., pixels], -1, 0))
         ratio = principal_ratio(scatters.sum(axis=0) - scatters, noise)
         variance = (every.size - 1) * ratio.var(axis=1, keepdims=True)
+        # For few windows widened as the interval of 95 % is, by Student's t.
         widened = (stdtrit(every.size - 1, 0.975) / NORMAL95) ** 2
         inverse = energy_of_variance(ratio.mean(axis=1, keepdims=True), variance, noise)
         result[label] = widened * inverse.max()
@@ -181,15 +173,15 @@ def _between_windows(image: Image, survey: Survey, noise: Array, shape: tuple[in
 
 
 def _blurred(sharp: Material, less: Material, more: Material, noise: Array) -> Material:
-    """Materials with the ratios at more blur, and what the blurs have changed as a variance.
-
-    What the last of them has, or half of what all have: of two simulated vessels 94 and 95 % of the
-    intervals hold so, 90 and 94 % by the last alone, 94 and 95 % by all with 1.2 times the error.
-    """
+    """Materials with the ratios at more blur, and what the blurs have changed as a variance."""
     wide = np.isfinite(more.ratio[-1])
     measured = wide & np.isfinite(less.ratio[-1])
     last, whole = (np.abs(more.ratio / before.ratio - 1.0) for before in (less, sharp))
+    # The last blur's change, or half of the whole, may be as much again beyond: of two simulated
+    # vessels 94 and 95 % of the intervals hold so, 90 and 94 % by the last change alone; by the
+    # whole, with 1.2 times the error, 94 and 95 %.
     change = np.fmax(last, 0.5 * whole)
+    # A material too narrow for a blur has the median change of the others.
     usual = np.median(change[:, measured], axis=1, keepdims=True) if measured.any() else 0.0
     ratio = np.where(wide, more.ratio, less.ratio)
     off = energy_of_variance(ratio, (np.where(measured, change, usual) * ratio) ** 2, noise)
@@ -200,7 +192,7 @@ def _blurred(sharp: Material, less: Material, more: Material, noise: Array) -> M
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def emissivities(inputs: Inputs, result: xr.Dataset) -> tuple[Floats, Floats]:
-    """Emissivities (band, pixel) [1] that lean on those around, and variance of the first's."""
+    """Emissivities (band, pixel) [1] that lean on neighbours', and the first band's variance."""
     raw, reference = system.first_emissivity(inputs, result), inputs.bands[0]
     variance = result["emissivity_std"].values[reference].ravel().astype(np.float64) ** 2
     sound = (result["status"].values.ravel() == 0) & (variance > 0)
@@ -211,28 +203,25 @@ def emissivities(inputs: Inputs, result: xr.Dataset) -> tuple[Floats, Floats]:
 def shared(
     value: Floats, variance: Floats, sound: Mask, shape: tuple[int, ...]
 ) -> tuple[Floats, Floats]:
-    """Values (pixel) [1] that lean on their neighbours, the more the less certain; and variances.
-
-    The mean of their posterior, of a normal prior with the mean and variance of the neighbourhood.
-    The variances are times the reduced chi-square about the median of those around, for a slow
-    change of what is mirrored is no noise. To lean does not lessen them: neighbours share such
-    errors. One that is not known has the neighbourhood's.
-    """
+    """Values (pixel) [1] that lean on their neighbours, more if less certain; and variances."""
     value, variance = (values.reshape(shape) for values in (value, variance))
     sound = sound.reshape(shape)
     weight = np.divide(1.0, variance, out=np.zeros(shape), where=sound)
     square = (value - _median(value, weight)) ** 2 * weight
+    # About the median around: a slow change of what is mirrored is no noise.
     chi = np.maximum(_median(square, weight) / chdtri(1, 0.5), 1.0)
     weight, wide = weight / chi, _AROUND * min(shape)
     mean = neighbour_mean(value, weight, wide)
     mean = np.where(np.isfinite(mean), mean, value)
+    # Normal prior of the neighbourhood's mean and variance. Leaning does not lessen a variance:
+    # neighbours share such errors. An unknown value takes the neighbourhood's variance.
     prior = np.nan_to_num(neighbour_mean((value - mean) ** 2, weight, wide))
     variance = np.where(sound, variance * chi, np.where(prior > 0, prior, variance))
     return ((prior * weight * value + mean) / (prior * weight + 1.0)).ravel(), variance.ravel()
 
 
 def _median(values: Floats, weight: Floats) -> Floats:
-    """Median (y, x) of the pixels around; one without weight counts as their mean."""
+    """Median (y, x) of the pixels around; pixels without weight count as the mean around."""
     filled = np.where(weight > 0, values, np.nan_to_num(neighbour_mean(values, weight, _WIDE)))
     reach = round(_WIDE)
     # At every few pixels, then interpolated: it changes as slowly as its window is wide.

@@ -73,13 +73,12 @@ class Scatters:
 
     @np.errstate(invalid="ignore", divide="ignore", over="ignore")
     def uncontradicted(self, material: tiles.Material) -> tiles.Material:
-        """Material with the ratios of the pixel where its bands contradict it, or it is of none.
-
-        As where the second camera sees another material at p than the first at r. There the method
-        has the pixel's ratios, too (`pixel.ratios`); its object is what pixels paired with p get.
-        """
+        """Material with the ratios of a pixel whose bands contradict it, or that has none."""
         white = self.freedom[:, np.newaxis, np.newaxis] * np.eye(len(self.noise))
         whole = np.moveaxis(self.scatter, -1, 0) + white
+        # As where the second camera sees another material at p than the first at r. There the
+        # method has the pixel's ratios, too (`pixel.ratios`), and pixels paired with p get the
+        # object.
         unlike = self.usable & ~reflection_ratio.agrees(whole, material.ratio / self.noise)
         ratio = self.ratio
         inverse = reflection_ratio.inverse_energy(self.scatter, ratio, self.noise, self.freedom)
@@ -106,10 +105,7 @@ class Planes:
 
     @np.errstate(invalid="ignore", divide="ignore", over="ignore")
     def combined(self, weights: Array, pixels: Any) -> tuple[Array, Array]:
-        """Combination (column, pixel) [K] of the bands by weights, and its variance at a frame.
-
-        Of each pixel so many functions as the Bayesian information criterion says, plus one.
-        """
+        """Combination (column, pixel) [K] of the bands by weights, and its variance at a frame."""
         whole = np.einsum("bp,bcp->cp", weights, self.smooth[..., pixels])
         noise = self.noise[0].reshape(len(weights), -1)[:, pixels]
         variance = np.maximum(((weights * noise) ** 2).sum(axis=0), reflection_ratio.TINY)
@@ -117,6 +113,7 @@ class Planes:
         energy = np.cumsum(whole[::-1] ** 2, axis=0)[::-1][self.steps :] / variance
         lowest = min(reflection_ratio.LOWEST_ORDER, orders - 1)
         cost = energy[lowest:] + np.arange(lowest, orders)[:, np.newaxis] * np.log(frames)
+        # As many functions as the Bayesian information criterion says, plus one.
         order = np.minimum(lowest + cost.argmin(axis=0) + 1, orders)
         whole[np.arange(len(whole))[:, np.newaxis] >= self.steps + order] = 0.0
         return whole, variance * (order + self.steps) / frames
@@ -141,7 +138,7 @@ class Planes:
         for first in range(bands):
             for second in range(first, bands):
                 total = np.einsum("fp,fp->p", flat[first], flat[second])
-                # The noise of the background, which is the first band's, is in the bend of others.
+                # The other bands' bend holds the background's noise, which is the first band's.
                 share = (first == second) + bend[first] * bend[second] - (first == 0) * bend[second]
                 total = total / (noise[first] * noise[second]) - freedom * share
                 scatter[first, second] = scatter[second, first] = total
@@ -203,7 +200,7 @@ class Response(NamedTuple):
     series: Array  # signal of the first less the reference [K], of temperatures over the range
     middle: float  # of the range [K]
     half: float
-    bends: Array  # signals of the others less that of the first (band - 1, degree), of it [K]
+    bends: Array  # coefficients of u_m - u_1 in u_1 less the reference (band - 1, degree) [K]
 
 
 @compiled
@@ -228,18 +225,14 @@ def _emit(film: npt.NDArray[np.float32], response: Response, emitted: Any) -> No
 def _straighten(
     signals: Array, emitted: npt.NDArray[np.float32], emissivity: Array, response: Response
 ) -> Array:
-    """Take the bend of the background out of signals (band, time, pixel) [K], in place.
-
-    The background is what the first band holds beside the signal of an object (time, pixel) [K];
-    where that is not known nothing is taken out. Returns the mean change of what is taken out with
-    the first band's signal (band, pixel) [1].
-    """
+    """Take the background's bend out of signals [K], in place; its mean slope (band, pixel) [1]."""
     bands, frames, pixels = signals.shape
     change = np.zeros((bands, pixels))
     low, high = _polynomial_at(response.series, -1.0), _polynomial_at(response.series, 1.0)
     for t in range(frames):
         for p in range(pixels):
             share = emissivity[0, p]
+            # What the first band holds beside the object; if unknown, nothing is taken out.
             background = (signals[0, t, p] - share * emitted[t, p]) / (1.0 - share)
             if np.isnan(background):
                 continue
@@ -248,6 +241,7 @@ def _straighten(
                 bend = _polynomial_at(response.bends[band - 1], background)
                 after = _polynomial_at(response.bends[band - 1], background + _STEP)
                 signals[band, t, p] -= (1.0 - emissivity[band, p]) * bend
+                # Change of the bend with the first band's signal.
                 rate = (after - bend) / (_STEP * frames * (1.0 - share))
                 change[band, p] += (1.0 - emissivity[band, p]) * rate
     return change
@@ -257,7 +251,7 @@ def _straighten(
 def _without_object(
     signals: Array, emitted: npt.NDArray[np.float32], emissivity: Array, response: Response
 ) -> None:
-    """Take an object's signal (time, pixel) [K] out of those (band, time, pixel) [K], in place."""
+    """Take an object's signal (time, pixel) out of signals (band, time, pixel) [K], in place."""
     bands, frames, pixels = signals.shape
     for t in range(frames):
         for p in range(pixels):

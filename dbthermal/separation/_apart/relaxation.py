@@ -36,13 +36,11 @@ class Terms(NamedTuple):
 
 @inlined
 def _other_bands(shares: Floats, pixel: int, bends: Floats, signal: Floats, result: Floats) -> None:
-    """Sum of a pixel's shares (band - 1, pixel) times u_m(x), of u_1(x) (frame) [K], in place.
-
-    The bend u_m - u_1 is a polynomial of u_1, by Horner's rule.
-    """
+    """Sum of a pixel's shares (band - 1, pixel) times u_m(x), of u_1(x) (frame) [K], in place."""
     for t in range(signal.size):
         value, total = np.float64(signal[t]), 0.0
         for band in range(shares.shape[0]):
+            # The bend u_m - u_1 is a polynomial of u_1, by Horner's rule.
             bend = 0.0
             for degree in range(bends.shape[1] - 1, -1, -1):
                 bend = bend * value + bends[band, degree]
@@ -59,7 +57,7 @@ def other_bands(shares: Floats, bends: Floats, signal: Floats, result: Floats) -
 
 @inlined
 def _at_p(terms: Terms, pixel: int, signal: Floats, film: Floats) -> None:
-    """Signal u_1(x(p)) (frame) [K] of a pixel, of those at r (pixel, frame), in place."""
+    """Signal u_1(x(p)) (frame) [K] of a pixel, from all signals at r (pixel, frame), in place."""
     if terms.way[pixel] == LOOSE:
         change = terms.change[terms.place[pixel]]
         for t in range(film.size):
@@ -111,11 +109,9 @@ def _backward(
 
 @compiled
 def relax(terms: Terms, target: Floats, signal: Floats, step: Floats) -> None:
-    """Solve for u_1(x(r)) (pixel, frame) [K] from a start, and its last steps (pixel), in place.
-
-    By the method of Gauss and Seidel: each pixel in turn, of the others' values so far.
-    """
+    """Solve for u_1(x(r)) (pixel, frame) [K] from a start, and its last steps (pixel), in place."""
     film, spare = np.empty(signal.shape[1]), np.empty(signal.shape[1])
+    # Method of Gauss and Seidel: each pixel in turn, of the other pixels' values so far.
     for _ in range(_STEPS):
         largest = 0.0
         for pixel in range(len(signal)):

@@ -24,7 +24,7 @@ Each: TypeAlias = Callable[[Inputs, Material | None], object]
 
 # Turns of the materials and the object at each camera's place; and the median change of the
 # emissivities that ends them: of simulated scenes below 0.0026 a second turn changes no error by
-# more than 2 %, of one of 0.008 it makes the error 2.6 times less.
+# more than 2 %, at a change of 0.008 it makes the error 2.6 times less.
 _TURNS, _SETTLED = 2, 0.003
 _OBJECTS: Final = "objects"  # what a displacement keeps of the pixels alone
 
@@ -72,15 +72,13 @@ def pooled(
     materials: Callable[..., Material | None],
     regroup: pool.Regroup | None = None,
 ) -> None:
-    """Separate with materials, from a result of each pixel alone before.
-
-    The first are those of the object and emissivities of pixels alone, and may be regrouped; the
-    second those of what the first make of these.
-    """
+    """Separate with materials, from a result of each pixel alone before."""
     assert inputs.displacement is not None
     frames = joint.Frames.of(before)
     objects: joint.Joint | None = inputs.displacement.found[_OBJECTS]
     shares, _ = neighbours.emissivities(inputs, before)
+    # The first turn finds materials by the object and emissivities of pixels alone, and may regroup
+    # them; the second by the object and emissivities of the first turn.
     for turn in range(_TURNS):
         inputs = replace(inputs, difference=None if objects is None else objects.difference)
         # Of a smooth object the difference changes no rapid product.

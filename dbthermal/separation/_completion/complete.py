@@ -167,7 +167,7 @@ def filled(
         measured = without_calibration(solve(corrected, response, **shared))
     scene = scenes.gather(inputs, result, measured, context.prior)
     sample = scene.sample()
-    if not scene.apart:  # else the result's reflections are those of two places
+    if not scene.apart:  # else the result's reflections come from two places
         scenes.require_same_capture(scene, result, sample)
     if context.surroundings is None:
         level = scenes.find_level(scene, sample)
@@ -218,12 +218,10 @@ def _checked(result: xr.Dataset, corrected: xr.Dataset) -> xr.Dataset:
 
 
 def _complete_rows(scene: Scene, completed: xr.Dataset, lacking: Mask, rows: slice) -> None:
-    """Complete the pixels of some rows, in place; what was measured is not touched.
-
-    The samples that lack one of the films are marked (time, y, x), in place.
-    """
+    """Complete the pixels of some rows, in place; what was measured is not touched."""
     films = [np.isnan(completed[name].values[:, rows]) for name in FILMS]
     maps = [np.isnan(completed[name].values[:, rows]) for name in MAPS]
+    # Samples (time, y, x) that lack one of the films are marked.
     lacking[:, rows] = np.any(films, axis=0)
     pixels = lacking[:, rows].any(axis=0) | np.any(maps, axis=(0, 1))
     if not pixels.any():
@@ -304,27 +302,21 @@ def _take(
     filled: Mask,
     beyond: Mask,
 ) -> None:
-    """Take new values and deviations (time, pixel) where a film or map has none, in place.
-
-    And tell the pixels that take some, and some outside the limits by several deviations.
-    """
+    """Take new values and deviations (time, pixel) where a film or map has none, in place."""
     for t in range(len(value)):
         for p in range(len(places)):
             place = (t, places[p, 0], places[p, 1])
             a, b = new[t, p], new_std[t, p]
             if np.isnan(value[place]) and np.isfinite(a) and np.isfinite(b):
                 value[place], std[place], filled[p] = a, b, True
+                # Outside the limits by several deviations.
                 margin = tiles.RANGE_SIGMAS * b
                 beyond[p] |= a < limits[0] - margin or a > limits[1] + margin
 
 
 def _bridge_rows(completed: xr.Dataset, frames: Mask, lacking: Mask, rows: slice) -> Whole:
-    """Bridge gaps of single pixels of some rows by lines, in place.
-
-    Only in the frames (time) that some pixel has. Returns how many each pixel (y, x) had, in one of
-    the films. Of the samples that were lacking those are left, in place, that a measured pixel now
-    has: by frame, not by pixel. A pixel that lacked too many gets a bit of the status, too.
-    """
+    """Bridge gaps of single pixels of some rows by lines, in place; return their number (y, x)."""
+    # Only in the frames (time) that some pixel has.
     time = completed["time"].values[frames].astype(np.float64)
     number = np.zeros(completed["status"].values[rows].shape, dtype=np.intp)
     for name in FILMS:
@@ -338,9 +330,11 @@ def _bridge_rows(completed: xr.Dataset, frames: Mask, lacking: Mask, rows: slice
         films[0][place], films[1][place] = curves.T, np.sqrt(variances).T
         number[y, x] = np.maximum(number[y, x], gaps[y, x])
         release()
+    # Lacking samples stay marked where a measured pixel now has a bridged value.
     bridged, status = lacking[:, rows], completed["status"].values[rows]
     bridged &= np.isfinite(completed[FILMS[0]].values[:, rows])
     bridged &= (status & np.uint32(schema.COMPLETED & ~Status.COMPLETED_FRAMES)) == 0
+    # A pixel that lacked too many frames gets a bit of the status, too.
     mostly = bridged.mean(axis=0) >= quality.MOST_BRIDGED
     status |= mostly * np.uint32(Status.COMPLETED_FRAMES)
     if "bridged" in completed:

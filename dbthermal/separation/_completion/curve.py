@@ -60,25 +60,21 @@ def bins(tile: Tile, valid: Mask) -> Bins:
 def curve(
     tile: Tile, means: Bins, offset: Array, stray: Array | float = 0.0, bend: Array | float = 0.0
 ) -> Curve:
-    """Other bands over the first; offsets (band - 1) [K] of a pixel against them are not known.
-
-    Nor is what a slow change of the background bends them by, of deviations (band - 1, pixel) [K].
-    It would pass for the bend of the responses, which is large for a hot metal alone.
-
-    The variance is that of the noise, or the bins' if it is more: there the background fluctuates.
-    The first band has a variance of strays [K^2], beside the noise, which the others do not follow.
-    """
+    """Other bands over the first, of unknown offsets (band - 1) and bends (band - 1, pixel) [K]."""
     weight, first = means.frames, means.signals[0]
     total = np.maximum(weight.sum(axis=0), 1.0)
     middle = (weight * first).sum(axis=0) / total
     centred = np.where(weight > 0, first - middle, 0.0)
     energy = (weight * centred**2).sum(axis=0)
     bins_used = np.count_nonzero(weight, axis=0)
+    # Strays of the first band [K^2], beside the noise, are not followed by the other bands.
     centred = centred * (energy > _SEEN * (tile.noise[0] ** 2 * bins_used + stray * total))
     half = np.maximum(np.abs(centred).max(axis=0), _LEAST_RANGE)
     base = _lagrange(centred / half)  # (node, bin, pixel)
     gram = np.einsum("ibp,bp,jbp->ijp", base, weight, base)
     information, linear = [], []
+    # A slow change of the background bends the bands: it would pass for the bend of the responses,
+    # which is large for a hot metal alone.
     bends = np.broadcast_to(bend, (len(tile.noise) - 1, total.size))
     ridge = 1e-9 * total * np.eye(4)[..., np.newaxis]
     for m in range(1, len(tile.noise)):
@@ -86,6 +82,7 @@ def curve(
         fitted = np.linalg.solve(np.moveaxis(gram + ridge, -1, 0), moment.T[..., np.newaxis])
         residual = means.signals[m] - np.einsum("ibp,pi->bp", base, fitted[..., 0])
         noise = tile.noise[m] ** 2 + tile.noise[0] ** 2  # of one frame
+        # That of the noise, or the bins' if it is more: there the background fluctuates.
         variance = _long_run(residual, weight, bins_used, noise)
         inverse, right = gram / variance, moment / variance
         # Of a constant, quadratic and cubic part of variance p^2 is told nothing:

@@ -50,11 +50,11 @@ class Level:
     signal: Array | float  # first band's signal, less the reference (pixel) [K]
     std: Array | float  # (pixel) [K]
     fluctuation: float  # standard deviation over time [K]
-    rapid: float = np.inf  # that of its rapid changes [K]
-    scatter: float = np.inf  # of the logarithm of these between pixels [1]
+    rapid: float = np.inf  # standard deviation of its rapid changes [K]
+    scatter: float = np.inf  # of the logarithm of rapid changes between pixels [1]
 
     def at(self, places: Whole) -> "Level":
-        """Return the level of some pixels, each of its own."""
+        """Return the level of some pixels, an array each (pixel)."""
         arrays = (np.asarray(array, dtype=np.float64) for array in (self.signal, self.std))
         signal, std = (
             array[places] if array.ndim else np.full(places.size, array) for array in arrays
@@ -85,11 +85,9 @@ class Moments(Pixels):
 
 
 def moments(tile: Tile, data: Curve, prior: Mixture, level: Level, rapid: Array) -> Moments:
-    """Posterior of the emissivities and of the background's level, steps 1 and 2.
-
-    The `rapid` changes (pixel) [K] bound what the pixel mirrors, see `_of_rapid`.
-    """
+    """Posterior of the emissivities and of the background's level, steps 1 and 2."""
     grid = prior.grid()  # (grid, pixel)
+    # The rapid changes (pixel) [K] bound what the pixel mirrors.
     mirrored = _of_rapid(grid, rapid, level) if prior.weight.size > 1 else np.zeros_like(grid)
     (points, pixels), size = grid.shape, len(tile.noise) + 1
     levels = np.stack([np.broadcast_to(array, pixels) for array in (level.signal, level.std)])
@@ -119,11 +117,9 @@ def moments(tile: Tile, data: Curve, prior: Mixture, level: Level, rapid: Array)
 
 
 def _of_rapid(grid: Array, rapid: Array, level: Level) -> Array:
-    """Log-likelihood (grid, pixel) of the rapid changes of a pixel beside the background's.
-
-    A surface mirrors 1 - e_1 of them, and it may face calmer ones. That they are livelier is as
-    probable as their logarithms scatter; or it is the object that changes rapidly.
-    """
+    """Log-likelihood (grid, pixel) of the rapid changes of a pixel beside the background's."""
+    # A surface mirrors 1 - e_1 of the changes, and may face calmer ones. Livelier changes are as
+    # probable as their logarithms scatter; or the object itself changes rapidly.
     with np.errstate(divide="ignore"):
         excess = np.nan_to_num(np.maximum(np.log(rapid / level.rapid / (1.0 - grid)), 0.0))
     return np.maximum(-0.5 * (excess / level.scatter) ** 2, math.log(_OTHERWISE))
@@ -146,12 +142,9 @@ def _moments(
     knowledge: tuple[Array, ...],
     result: tuple[Array, Array, Array],
 ) -> None:
-    """Probability on the grid (pixel, grid), and moments of (e, c) and (1 / e_1, e_m / e_1, c).
-
-    (pixel, 2, band + 1), (pixel, 2, band + 1, band + 1), in place; the weights are logarithms. Of
-    each pixel its grid, mean and covariance of the prior's components, the background's level and
-    its deviation, and the parts of its `Curve`.
-    """
+    """Probability on the grid (pixel, grid), and moments of (e, c) and (1 / e_1, e_m / e_1, c)."""
+    # Of each pixel its grid, mean and covariance of the prior's components, the background's level
+    # and its deviation, the log-likelihood of rapid changes, and the parts of its `Curve`.
     grids, means, covariances, levels, mirrored, nodes, information, linear = knowledge
     points, components, second = grids.shape[1], weight.size, means.shape[2] - 1
     # Prior and posterior of (grid, component), logarithms at first, and the precisions of c.
@@ -196,10 +189,7 @@ def _moments(
 def _condition(
     prior: tuple[Array, Array, Array], grid: Array, density: Array, normal: Array, whole: Array
 ) -> None:
-    """Log-density of the first emissivity, and mean and precision of the others at it, in place.
-
-    The others are taken as independent given the first.
-    """
+    """Log-density of the first emissivity, and mean and precision of the others at it, in place."""
     (weight, mean, covariance), last = prior, grid.size - 1
     for g in range(grid.size):
         low, high = max(g - 1, 0), min(g + 1, last)
@@ -210,6 +200,7 @@ def _condition(
             for m in range(mean.shape[1] - 1):
                 slope = covariance[k, 1 + m, 0] / variance
                 normal[g, k, 0, m] = mean[k, 1 + m] + slope * off[k]
+                # The other emissivities are taken as independent given the first.
                 spread = covariance[k, 1 + m, 1 + m] - slope * covariance[k, 1 + m, 0]
                 normal[g, k, 1, m] = 1.0 / max(spread, 1e-8)
         share = np.exp(log - log.max())
@@ -242,10 +233,7 @@ def _quadratic(
     spare: Array,
     likelihood: Array,
 ) -> None:
-    """Log-likelihoods of the other bands as quadratic functions about zero, in place.
-
-    Near (e_1, e_m, c): value; slopes with e_m, with c; curvatures with e_m, both, c.
-    """
+    """Log-likelihoods of the other bands as quadratic functions about zero, in place."""
     nodes, informations, linears = curve
     signal, emitted, rate = spare[0], spare[1], spare[2]
     base, of_e, of_c = np.empty(4), np.empty(4), np.empty(4)
@@ -275,6 +263,7 @@ def _quadratic(
                 by_e += of_e[i] * (linear[i] - hb)
                 by_c += of_c[i] * (linear[i] - hb)
                 ee, ec, cc = ee + of_e[i] * he, ec + of_e[i] * hc, cc + of_c[i] * hc
+            # Value; slopes with e_m, with c; curvatures with e_m, with both, with c.
             result = likelihood[g, m]
             result[0], result[1], result[2] = value, by_e, by_c
             result[3], result[4], result[5] = ee, ec, cc
@@ -284,12 +273,10 @@ def _quadratic(
 def _eliminate(
     likelihood: Array, normal: Array, level: Array, values: Array, slope: Array, loose: Array
 ) -> tuple[float, float]:
-    """Evidence, and the precision of c; mean of (e_m, c), slopes of e_m with c and variances at it.
-
-    Given c the e_m are independent, so they are eliminated first, and c last.
-    """
+    """Evidence, precision of c, mean of (e_m, c), and slopes of e_m with c and variances at it."""
     precision, evidence, scale = 1.0 / level[1] ** 2, 0.0, 1.0
     curvature, toward = precision, precision * level[0]
+    # Given c the e_m are independent, so they are eliminated first, and c last.
     for m in range(loose.size):
         mean, weight, ec = normal[0, m], normal[1, m], likelihood[m, 4]
         variance, right = 1.0 / (likelihood[m, 3] + weight), likelihood[m, 1] + mean * weight
@@ -307,16 +294,14 @@ def _eliminate(
 
 @compiled
 def _normalise(weight: Array, values: Array, slope: Array, loose: Array, stiff: Array) -> None:
-    """Weights (grid, component) that add up to 1 of logarithms, in place.
-
-    Each times the probability that the other emissivities lie between 0 and 1.
-    """
+    """Weights (grid, component) that add up to 1 of logarithms, in place."""
     for g, k in np.ndindex(weight.shape):
         weight[g, k] = weight[g, k] if np.isfinite(weight[g, k]) else -np.inf
     highest = weight.max()
     for g, k in np.ndindex(weight.shape):
         share = np.exp(weight[g, k] - highest)
         for m in range(slope.shape[2] if share > _NEGLIGIBLE else 0):
+            # Times the probability that the other emissivities lie between 0 and 1.
             variance = slope[g, k, m] ** 2 / stiff[g, k] + loose[g, k, m]
             value, scale = values[g, k, 1 + m], 1.0 / np.sqrt(2.0 * variance)
             share *= 0.5 * (math.erf((1.0 - value) * scale) + math.erf(value * scale))
@@ -353,10 +338,7 @@ def _average(terms: tuple[Array, ...], relative: int, mean: Array, spread: Array
 
 
 def fluctuation(tile: Tile, static: Moments, means: Bins, expected: float) -> Array:
-    """Variance (pixel) [K^2] of the background over time: what bins show beyond noise.
-
-    Weighed against what is expected, as uncertain as it is large.
-    """
+    """Variance (pixel) [K^2] of the background over time: what bins show beyond noise."""
     vague = np.full_like(static.level, _VAGUE)
     bins_alone = replace(tile, signals=means.signals)
     free = frames.solve(bins_alone, static.point, static.level, vague)
@@ -368,6 +350,7 @@ def fluctuation(tile: Tile, static: Moments, means: Bins, expected: float) -> Ar
     noise = np.where(used, noise, 0.0).sum(axis=0) / count
     # A variance of n values is known to 2 / n of its square.
     precision = (count - 1) / (2.0 * np.maximum(total, noise) ** 2)
+    # What is expected is as uncertain as it is large.
     prior = expected**-4.0
     excess = np.maximum(total - noise, 0.0)
     result = (precision * excess + prior * expected**2) / (precision + prior)

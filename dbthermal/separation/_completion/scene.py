@@ -34,7 +34,7 @@ _FLUCTUATION: Final = 2.0
 _LEAST: Final = (0.2, 0.1)
 # Pixels from which the surroundings are estimated, and the residual of a result is judged.
 _SAMPLE: Final = 400
-_MOST, _FEW = 2**22, 64  # samples of a band of these, down to so few pixels of a long capture
+_MOST, _FEW = 2**22, 64  # their samples in a band, at most; and fewest pixels of a long capture
 # Pixels of a material that tell its emissivity, and how much they differ, at least.
 _FEWEST: Final = 4
 # Chance by which a pixel tells other emissivities than its material's: of three deviations.
@@ -62,7 +62,7 @@ class Scene:
     emissivity: Array  # measured, in the pixel or in its material (band, pixel) [1]
     covariance: Array  # (band, band, pixel) [1]
     general: Mixture  # prior on the emissivities of any pixel
-    offset: Array  # deviation of a pixel's offset against the others, of the other bands [K]
+    offset: Array  # deviation of a pixel's offset against other pixels, of the other bands [K]
     level: Level
     apart: bool  # the cameras do not see the same reflection in a pixel
     measured: Mask  # pixels without a flag (pixel)
@@ -182,10 +182,7 @@ def stated(scene: Scene, surroundings: float | xr.DataArray, std: float) -> Leve
 def solve_statics(
     scene: Scene, tile: Tile, valid: Mask, source: int, places: Whole
 ) -> tuple[Moments, Array]:
-    """Posterior of what is constant in pixels of a tile whose emissivities come from one source.
-
-    And the variance of the background over time (pixel) [K^2].
-    """
+    """Posterior of what is constant in pixels of one source, and background variance [K^2]."""
     with np.errstate(all="ignore"):
         level = scene.level.at(places)
         means = curves.bins(tile, valid)
@@ -205,16 +202,13 @@ def solve_statics(
 def solve(
     scene: Scene, tile: Tile, valid: Mask, static: Moments, variance: Array, measured: Array
 ) -> Values:
-    """Complete the pixels of a tile, given what is constant in them.
-
-    The background is told with the object temperatures that are `measured`, and their deviations
-    (2, time, pixel) [K], NaN elsewhere.
-    """
+    """Complete the pixels of a tile, given what is constant in them."""
     with np.errstate(all="ignore"):
         constants = static.point, static.level, variance, static.covariance
         statics = frames.solve(tile, *constants, apart=scene.apart)
         signal, remainder = windows.smooth(statics.signal, statics.white, valid, tile.time)
         background, spread = statics.background, statics.background_variance
+        # Measured objects, with their deviations (2, time, pixel) [K], tell the background.
         if (selected := np.isfinite(measured[0]).any(axis=0)).any():
             moments, block = static.select_pixels(selected), tile.select_pixels(selected)
             constants = moments.emissivity, moments.level, variance[selected], moments.covariance
@@ -246,17 +240,14 @@ def contradicted(scene: Scene, static: Moments, places: Whole) -> Mask:
 
 
 def find_level(scene: Scene, sample: Sample) -> Level:
-    """Level of the background over some pixels, from those that show it, beside what is known.
-
-    Each pixel's posterior without the prior in it is a measurement; their weighted median, and the
-    scatter that they do not explain, which is how much pixels differ. Pixels whose emissivities
-    come from one prior, or from other pixels, share its error: together they count as one pixel.
-    """
+    """Level of the background over some pixels, from those that show it, beside what is known."""
     tile, valid, places = sample
     sources = np.where(valid.any(axis=0), scene.source[places], -1)
     estimates, counted = [], []
     for source in np.unique(sources[sources >= 0]):
         of_source = sources == source
+        # Pixels whose emissivities come from one prior, or from other pixels, share its error:
+        # together they count as one pixel.
         counted.append(np.full(of_source.sum(), 1.0 if source == OWN else 1.0 / of_source.sum()))
         block, numbers = (tile.select_pixels(of_source), valid[:, of_source]), places[of_source]
         static, fluctuation = solve_statics(scene, *block, int(source), numbers)
@@ -264,7 +255,7 @@ def find_level(scene: Scene, sample: Sample) -> Level:
         estimates.append([static.level, static.covariance[-1, -1], before, fluctuation])
         if source != OWN:
             continue
-        # What measured pixels mirror of rapid changes: the fewer, the less it says of others.
+        # Rapid changes that measured pixels mirror: few such pixels say little of other pixels.
         std = curves.bins(*block).rapid(tile.noise[0]) / (1.0 - scene.emissivity[0, numbers])
         if (std := std[scene.measured[numbers] & np.isfinite(std)]).size:
             scatter = _SCATTER / float(np.sqrt(scene.measured.mean()))
@@ -273,7 +264,7 @@ def find_level(scene: Scene, sample: Sample) -> Level:
     if not estimates:
         return scene.level
     mean, after, before, fluctuation = np.concatenate(estimates, axis=1)
-    # Their mean, for those that are completed may be any of them: most of a scene may be at rest.
+    # The mean: a completed pixel may face any fluctuation; most of a scene may be at rest.
     level = replace(scene.level, fluctuation=max(float(np.sqrt(np.mean(fluctuation))), _LEAST[1]))
     # A posterior of precision 1 / after holds the prior's 1 / before.
     variance = 1.0 / np.maximum(1.0 / after - 1.0 / before, _NOTHING)
@@ -284,6 +275,7 @@ def find_level(scene: Scene, sample: Sample) -> Level:
     if not np.any(seen):
         return level
     value, variance, pixels = value[seen], variance[seen], np.concatenate(counted)[seen]
+    # Weighted median, and the scatter that variances do not explain: how much pixels differ.
     weight = pixels / (variance + np.median(variance))
     middle = float(np.quantile(value, 0.5, weights=weight, method="inverted_cdf"))
     scatter = (MAD * float(np.median(np.abs(value - middle)))) ** 2

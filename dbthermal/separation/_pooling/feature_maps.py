@@ -32,15 +32,11 @@ _EMPTY: Final = 1e-3  # share of the largest weight below which a window holds n
 def mean_signals(
     corrected: xr.Dataset, response: xr.Dataset, bands: list[int], noise: Array
 ) -> tuple[Array, Array, Array]:
-    """Mean linearised signals (band, y, x) [K] of the bands, reference first, and variances [K^2].
-
-    NaN without a sample. Where neighbours differ by more than the noise (band) [K] explains, as by
-    a residual fixed pattern, that is added to the variance. And the mean of the reference (y, x)
-    [K] in the last third of the frames, less that in the first.
-    """
+    """Mean signals (band, y, x) [K] of the bands, variances, and the reference's change [K]."""
     counts = corrected["counts"]
     shape = (len(bands), counts.sizes["y"], counts.sizes["x"])
     means, frames, change = np.empty(shape), np.empty(shape), np.empty(shape[1:])
+    # The change is the mean of the last third of the frames less that of the first.
     third = max(counts.sizes["time"] // 3, 1)
     thirds = slice(third), slice(third, -third), slice(-third, None)
     names = [str(counts["band"].values[band]) for band in bands]
@@ -63,6 +59,7 @@ def mean_signals(
     # var(mean) = s_m^2 / N, and var(pattern) = var(z_m - z_r from pixel to pixel) - both of these
     inverse = np.divide(1.0, frames, out=np.full(shape, np.inf), where=frames > 0)
     variances = noise[:, np.newaxis, np.newaxis] ** 2 * inverse
+    # Neighbours that differ by more than noise, as by a residual fixed pattern, add a variance.
     for index in range(1, len(bands)):
         image = means[index] - means[0]
         bend = (image[2:] - 2.0 * image[1:-1] + image[:-2]) / np.sqrt(6.0)  # of variance s^2
@@ -77,9 +74,6 @@ def reflected_difference(result: xr.Dataset, bands: list[int], of: Mask) -> tupl
     r"""Reflection in differences of the bands' mean signals, (band - 1, y, x) [K], and variance.
 
     .. math:: (k_m - 1) (1 - e_{ref}) (\bar y - \mathrm{median}\, y)
-
-    The median is the background at rest, which makes no edges. 0 without a background estimate:
-    that is where nothing moved; and of other pixels than those (y, x).
     """
     dark = 1.0 - result["emissivity"].values[bands[0]]
     share = (result["reflection_ratio"].values[bands[1:]] - 1.0) * dark
@@ -89,12 +83,14 @@ def reflected_difference(result: xr.Dataset, bands: list[int], of: Mask) -> tupl
         film, std = (array[:, row, of[row]] for array in films)
         # Sorted along contiguous samples: far faster than a median along the first axis.
         ordered = np.sort(film.T.copy(), axis=1)
+        # The background at rest, which makes no edges.
         median = ordered[:, [(frames - 1) // 2, frames // 2]].mean(axis=1)
         excess[row, of[row]] = film.mean(axis=0) - median
         deviation[row, of[row]] = std.mean(axis=0)
         release()
     # var(mean - median) = (pi / 2 - 1) s^2 / N of normal noise
     variance = (np.pi / 2 - 1) * (share * deviation) ** 2 / frames
+    # 0 where nothing moved, without a background estimate, and at pixels not selected.
     valid = np.isfinite(share * excess * variance)
     return np.where(valid, share * excess, 0.0), np.where(valid, variance, 0.0)
 

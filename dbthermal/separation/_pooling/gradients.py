@@ -83,14 +83,12 @@ class Gradient:
 
 
 def fit(measured: Places, asked: Places, cost: Cost, limit: int = DEGREE) -> Gradient:
-    """Gradient at some places from the costs of pixels at known ones, of a degree up to a limit.
-
-    And of one for which there are four pixels to a coefficient at least.
-    """
+    """Gradient at some places from the costs of pixels at known ones, of a degree up to a limit."""
     fits, pixels = [], cost.square.size
     for degree in range(limit + 2):
         functions = _powers(measured, measured, degree)
         normal = functions.T @ (cost.square[:, np.newaxis] * functions)
+        # A degree has at least four pixels to a coefficient.
         scarce = degree > 0 and pixels < _ENOUGH * functions.shape[1]
         if scarce or not np.linalg.cond(np.nan_to_num(normal)) < _SINGULAR:
             break
@@ -101,7 +99,7 @@ def fit(measured: Places, asked: Places, cost: Cost, limit: int = DEGREE) -> Gra
     if not fits:  # no pixel tells anything
         nothing, zero = np.full(asked[0].size, np.nan), np.zeros(pixels)
         return Gradient(0, nothing, nothing, (Left(zero, cost.square, cost.variance),) * 2)
-    # What pixels scatter beyond the highest degree is no gradient of theirs.
+    # Scatter of pixels beyond the highest degree is no gradient.
     beyond = np.sum(fits[-1][-1] ** 2 - cost.variance) / np.sum(cost.square**2)
     variance = cost.variance + max(float(beyond), 0.0) * cost.square**2
     chosen, highest = 0, 0.0
@@ -126,11 +124,7 @@ def fit(measured: Places, asked: Places, cost: Cost, limit: int = DEGREE) -> Gra
 
 
 def spreads(fits: list[Gradient]) -> list[float]:
-    """Variance of single pixels about each gradient, 0 where none is seen; or of squares of some.
-
-    Few pixels do not tell it. What all materials tell together, if it is seen, is taken for the
-    mean and the deviation of a normal distribution; that of a material is the posterior's mean.
-    """
+    """Variance of single pixels, or of squares of pixels, about each gradient; 0 where not seen."""
     scales = [_spreads([fit.left[scale] for fit in fits]) for scale in range(2)]
     return [max(pair) for pair in zip(*scales, strict=True)]
 
@@ -143,6 +137,8 @@ def _spreads(fits: list[Left]) -> list[float]:
         pairs = zip(excesses, sizes, strict=True)
         return [value if value > _seen(size) * std else 0.0 for (value, std), size in pairs]
     result = []
+    # Few pixels do not tell a spread: it is the posterior's mean, of a normal prior with the mean
+    # and deviation that all materials tell together.
     for fit in fits:
         value, deviation = fit.excess(usual)
         share = usual**2 / (usual**2 + deviation**2)
@@ -156,16 +152,10 @@ def _seen(freedom: int) -> float:
 
 
 def continuous(places: Places, values: Array, variances: Array, second: Mask, least: Array) -> bool:
-    """Say that a quantity has no step at the border of two regions.
-
-    Of values (map, pixel) with variances on both sides, and the pixels of the `second` (pixel,).
-
-    Of polynomials of the place, with a step at the border and without, the lowest Bayesian
-    information criterion decides. It must leave no more than noise, and the least step (map,) must
-    be one that would be seen at three standard deviations.
-    """
+    """Say that values (map, pixel) have no step at the border to the `second` region (pixel,)."""
     roots, lowest, result = 1.0 / np.sqrt(variances), np.inf, False
     for degree in range(_SMOOTH + 1):
+        # A polynomial of the place, without a step at the border and with one.
         design = np.append(_powers(places, places, degree), second[:, np.newaxis], axis=1)
         if second.size < _ENOUGH * design.shape[1]:
             break
@@ -175,9 +165,11 @@ def continuous(places: Places, values: Array, variances: Array, second: Mask, le
             heights = (root * value) @ basis
             with_step = np.sum((root * value) ** 2) - np.sum(heights**2)
             left += with_step + np.array([heights[-1] ** 2, 0.0])
+            # The least step (map,) must be one that would be seen at three standard deviations.
             seen &= step == 0.0 or abs(triangle[-1, -1]) * step > _SIGMAS
         coefficients = len(values) * (design.shape[1] - 1 + np.arange(2))
         criteria = left + coefficients * np.log(second.size)
+        # The lowest Bayesian information criterion decides, if it leaves no more than noise.
         if criteria.min() < lowest:
             lowest, noise = criteria.min(), chdtri(values.size - coefficients[0], _CHANCE)
             result = bool(seen and criteria[0] <= criteria[1] and left[0] < noise)

@@ -39,10 +39,10 @@ from dbthermal.separation._tiles import Material
 
 NONE: Final = -1  # label of pixels that belong to no material: they are pooled with nobody
 
-# Sizes of the cells, and of those that a mixed cell is cut into [pixel].
+# Sizes of the cells, and of the cells that a mixed cell is cut into [pixel].
 _SPACINGS: Final = (8, 4, 2)
-# False-alarm probability of a step [1]. A link that is refused in error is made
-# elsewhere; one that is made in error bleeds: this is no small number.
+# False-alarm probability of a step [1], not small: a link that is refused in error is made
+# elsewhere, but a link that is made in error bleeds.
 _STEP_RATE: Final = 0.1
 # Probability that two cells without a border are said to hold one [1].
 _BORDER_RATE: Final = 0.01
@@ -161,11 +161,7 @@ def materials(
 
 
 def without_borders(labels: xr.DataArray, result: xr.Dataset, response: xr.Dataset) -> xr.DataArray:
-    """Labels (y, x) less the pixels beside another one that may as well be of that, or of both.
-
-    Lenses and resampling mix what meets at a border, and the maps show it within a pixel or two. A
-    pixel stays if its own ratio is its region's, and no neighbour's, by three deviations.
-    """
+    """Labels (y, x) without the pixels at a border that may be of the neighbour, or of both."""
     ratios, _ = _features(result, _bands(result, response)[0])
     cells = np.asarray(labels.values + 1, dtype=np.intp)
     every = np.arange(cells.max() + 1)[np.newaxis]
@@ -173,11 +169,13 @@ def without_borders(labels: xr.DataArray, result: xr.Dataset, response: xr.Datas
     means, variances, stated = (array[:, 0] for array in pooled)
 
     def distance(regions: Labels) -> Array:
-        """Squares of deviations (y, x) by which the own ratios differ from those of cells."""
+        """Squares of deviations (y, x) by which pixels' ratios differ from the cells' ratios."""
         total = ratios.variances + variances[:, regions]
         square = np.sum((ratios.values - means[:, regions]) ** 2 / total, axis=0)
         return np.where(np.all(stated[:, regions], axis=0), square, np.nan)
 
+    # Lenses and resampling mix materials within a pixel or two of a border. A pixel stays if its
+    # own ratio is its region's, and no neighbour's, by three deviations.
     to_region, stays, padded = (distance(cells), np.ones(cells.shape, dtype=bool), np.pad(cells, 1))
     height, width = cells.shape
     for y, x in product(range(3), repeat=2):
@@ -188,7 +186,7 @@ def without_borders(labels: xr.DataArray, result: xr.Dataset, response: xr.Datas
 
 
 def others(labels: xr.DataArray, result: xr.Dataset) -> xr.DataArray:
-    """Materials (y, x), and connected pixels of none of them as further labels."""
+    """Materials (y, x), and connected pixels without a material as further labels."""
     telling = int(_UNUSABLE | Status.NO_BACKGROUND_MOTION)  # else it would agree with any
     free = (labels.values < 0) & ((result["status"].values & telling) == 0)
     regions = feature_maps.connected(free.astype(np.intp)) * free
@@ -200,11 +198,7 @@ def others(labels: xr.DataArray, result: xr.Dataset) -> xr.DataArray:
 def joined(
     labels: xr.DataArray, per_pixel: xr.Dataset, pooled: Material | None, response: xr.Dataset
 ) -> xr.DataArray:
-    """Regions (y, x) joined with those they touch, if what was pooled over each agrees.
-
-    A material is cut where ratios of single pixels are biased by what their order leaves of the
-    object; pooled ratios are not. So are regions without a step, as where an emissivity changes.
-    """
+    """Regions (y, x) joined with regions that they touch, if what was pooled over each agrees."""
     if pooled is None:
         return labels
     cells = np.asarray(labels.values + 1, dtype=np.intp)
@@ -215,8 +209,10 @@ def joined(
     features = _both(*(array.reshape(-1, *cells.shape) for array in arrays))
     merged = Regions(cells, replace(features, common=np.ones_like(features.common)), _ERROR_RATE)
     pairs = region_merging.neighbours(cells)
+    # A material is cut where ratios of single pixels are biased by what their order leaves of the
+    # object; pooled ratios are not.
     merged.join_alike(pairs, _RESOLUTION)
-    # Of a gray region, or one at rest, the ratio is told, and not the emissivity.
+    # A gray or resting region has a ratio, but no emissivity.
     maps, boxes, grown = _features(per_pixel, bands), find_objects(cells), True
     reach = _SPACINGS[0]
     while grown:
@@ -232,6 +228,7 @@ def joined(
             roots = merged.roots()[cells[window]]
             regions = roots == first, roots == second
             ratios, both = (array.window(window) for array in maps)
+            # Regions without a step are joined too, as where an emissivity changes over a body.
             same = region_merging.alike(*regions, ratios, both)
             if same and region_merging.continuous(*regions, both, _RESOLUTION, reach):
                 merged.join(first, second)
@@ -265,12 +262,12 @@ def _bands(result: xr.Dataset, response: xr.Dataset) -> tuple[list[int], Array]:
 
 
 def _sharing(result: xr.Dataset) -> float:
-    """Number of pixels that share an error of their ratios, as those of bands that are blurred."""
+    """Number of pixels that share an error of their ratios, as ratios of blurred bands do."""
     return float(result["reflection_ratio_std"].attrs.get("pixels", 1.0))
 
 
 def _features(result: xr.Dataset, bands: list[int]) -> tuple[Features, Features]:
-    """Ratios of all bands but the reference; and these with the reference's emissivity."""
+    """Ratios of all bands but the reference, without and with the reference's emissivity."""
     ratio, ratio_std, emissivity, emissivity_std = (
         result[name].values[bands].astype(np.float64) for name in _NEEDED[1:5]
     )
@@ -308,10 +305,7 @@ def _cells(
 def _links(
     cells: Labels, pairs: Labels, emitted: Array, variances: Array, change: Array
 ) -> tuple[Labels, Array]:
-    """Pairs of cells with no step between them in the emitted maps, and the steps' significances.
-
-    A border shows in proportion to the object's change: no step is no proof without one.
-    """
+    """Pairs of cells without a step between them in the emitted maps, and steps' significances."""
     order = np.argsort(cells, axis=None, kind="stable")
     places = np.split(order, np.cumsum(np.bincount(cells.ravel()))[:-1])  # pixels of each cell
     shape = (len(emitted), -1)
@@ -319,6 +313,7 @@ def _links(
     for index, pair in enumerate(pairs):
         first, second = (places[cell] for cell in pair)
         pixels = np.concatenate([first, second])
+        # A border shows in proportion to the object's change: no step is no proof without a change.
         least = _LEAST_STEP * np.abs(np.mean(change.ravel()[pixels]))
         where = np.divmod(pixels, cells.shape[1])
         variance = noise[:, pixels].mean(axis=1)
@@ -334,11 +329,8 @@ def step(
 
     .. math:: f(x, y) = \sum_{i + j \le 3} c_{ij} x^i y^j + h [p \in \mathrm{second}]
 
-    is fitted to maps (map, pixel) [K] of a noise variance (map,) [K^2] by least squares; rows and
-    columns (pixel,) list the first cell's pixels before the second's. The result is the sum over
-    the maps of :math:`h^2 / \mathrm{var}(h)`. It is infinite where the residual is more than noise,
-    for then a border lies elsewhere than between the cells, and where the pixels are too few, or
-    too noisy to show the least step [K] at three standard deviations.
+    is fitted by least squares to maps (map, pixel) [K], the first cell's pixels before the
+    second's; :math:`h^2 / \mathrm{var}(h)` is summed over the maps, infinite if no step is told.
     """
     pixels = places[0].size
     y, x = ((place - place.mean()) / _SPACINGS[0] for place in places)
@@ -348,10 +340,12 @@ def step(
         return np.inf
     # design = Q R: h = q^T f / r with q, r the last column and corner, var(h) = s^2 / r^2.
     orthonormal, triangle = np.linalg.qr(design)
+    # Too noisy to show the least step [K] at three standard deviations.
     if np.any(9.0 * variance > (least * triangle[-1, -1]) ** 2):
         return np.inf
     heights = values @ orthonormal
     residual = np.sum((values - heights @ orthonormal.T) ** 2, axis=1) / variance
+    # More than noise: a border lies elsewhere than between the cells.
     if np.any(residual > chdtri(pixels - design.shape[1], _BORDER_RATE)):
         return np.inf
     return float(np.sum(heights[:, -1] ** 2 / variance))

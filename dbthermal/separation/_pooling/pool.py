@@ -25,9 +25,9 @@ Surveyor: TypeAlias = Callable[[Inputs, Material | None, Mask], Survey]
 """Surveys some pixels of the image (pixel), alone or with the ratios of their materials."""
 
 Regroup: TypeAlias = Callable[[Material | None], Labels]
-"""Labels (pixel) of materials, of what is told of those before."""
+"""New labels (pixel) of materials, from the estimates of the materials before."""
 
-# Share of a material's pixels that have an emissivity alone, from which it is theirs [1].
+# Share of a material's pixels with an emissivity alone, from which they tell it for all [1].
 _MOST_TOLD: Final = 0.98
 _ROUNDS: Final = 6  # rounds of leaving out pixels that are not of the material
 _INNER: Final = 0.8  # share of its pixels that a ratio needs; by 0.5 objects are 2 % further off
@@ -36,7 +36,7 @@ _MAJORITY: Final = 0.5  # share of pixels with an emissivity alone that speaks f
 _REACH, _SINGLE = 2, 3
 _HARDLY: Final = 0.5  # deviation of a ratio pooled over that alone, from which it hardly helps [1]
 _MOSTLY: Final = 0.5  # share of gray pixels from which their material is [1]
-# Square of the difference in deviations that is no chance, of a pixel and of those around [1].
+# Square of the difference in deviations that is no chance, of a pixel and of its neighbours [1].
 _MORE, _MORE_AROUND = 4.0, 1.5
 # Deviation of the neighbourhood that shares such errors [pixel], and its least weight [1].
 _AROUND, _SOME = 1.5, 1e-3
@@ -47,17 +47,13 @@ _FRAMES: Final = 64  # that tell how much an object differs, about
 def materials(
     inputs: Inputs, survey: Surveyor, surveys: Survey | None, stated: Material | None = None
 ) -> Material | None:
-    """Ratios and emissivity of the material of each pixel of the image; None if none are told.
-
-    Of the surveys of all pixels alone, made of some if not at hand. Those that have an emissivity
-    alone are a selection by their ratios: unless they are nearly all of their material, all of it
-    are surveyed again, with its ratios. Those `stated` stay, and pixels are surveyed with them.
-    """
+    """Ratios and emissivity of the material of each pixel of the image; None if none are told."""
     labels, noise = inputs.labels, inputs.noise[inputs.bands]
     assert labels is not None
     width, unknown = inputs.capture.sizes["x"], np.full(labels.size, np.nan)
     selected = select(_inner(labels.reshape(-1, width)))
     places = np.flatnonzero(selected)
+    # Stated ratios stay, and pixels are surveyed with them.
     if surveys is None:
         before = None if stated is None else replace(stated, noise_variance=unknown)
         surveys = survey(inputs, before, selected)
@@ -69,6 +65,8 @@ def materials(
     count = int(labels.max()) + 1
     conditions = per_pixel.frames[0] > 0, np.isfinite(per_pixel.emissivity)
     sound, valid = (total(labels[places], 1.0 * holds, count) for holds in conditions)
+    # Pixels with an emissivity alone are a selection by their ratios: unless they are nearly all of
+    # their material, all its pixels are surveyed again, with its ratios.
     asked = (valid <= _MOST_TOLD * sound)[labels[places]] & np.isfinite(material.ratio[-1, places])
     if stated is not None or not np.any(asked):
         return material
@@ -80,10 +78,8 @@ def materials(
 
 
 def _inner(labels: Labels) -> Labels:
-    """Labels (pixel) of an image, -1 beside another one if most of a material's are elsewhere.
-
-    What a lens mixes agrees with either material, and biases its ratio by up to 4 deviations.
-    """
+    """Labels (pixel), -1 at the border of a material if most of its pixels lie inside."""
+    # What a lens mixes agrees with either material, and biases its ratio by up to 4 deviations.
     inner = minimum_filter(labels, _SINGLE) == maximum_filter(labels, _SINGLE)
     within = np.bincount(labels[inner] + 1, minlength=labels.max() + 2)
     few = within < _INNER * np.bincount(labels.ravel() + 1)
@@ -106,20 +102,17 @@ def select(labels: Labels) -> Mask:
 def estimate(
     image: Image, labels: Labels, survey: Survey, noise: Array, material: Material | None = None
 ) -> Material:
-    r"""Ratios and emissivity at all pixels, from surveyed ones of given labels (surveyed,).
-
-    The scatters of the pixels are added, and their principal axis gives the material's ratios: the
-    maximum of the likelihood, without the bias of a mean of ratios. The emissivity is the mean of
-    the pixels' own, corrected to these ratios. Both may have `gradients` over the place. A pixel
-    that differs from its material by more than four standard deviations is left out. The noise is
-    that of the bands [K]; NaN for a material without information. Ratios of a `material` are kept.
-    """
+    """Ratios and emissivity at all pixels, from surveyed pixels of given labels (surveyed,)."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         count = int(image.labels.max()) + 1
+        # The principal axis of the added scatters is the maximum of the likelihood, without the
+        # bias of a mean of ratios. The emissivity is the mean of the pixels' emissivities,
+        # corrected to these ratios.
         ratio_set, used, most = _sound(labels, count, survey, noise)
         if material is None:
             common, used = _common(image, labels, (ratio_set, used, most), survey, noise)
         else:
+            # Ratios of a stated material are kept; NaN of a material without information.
             stated = np.isfinite(material.ratio[-1])
             ratio = np.where(stated, material.ratio, image.expand(ratio_set.ratio))
             variance = np.where(stated, material.inverse_energy, image.expand(ratio_set.variance))
@@ -128,8 +121,8 @@ def estimate(
 
 
 def _sound(labels: Labels, count: int, survey: Survey, noise: Array) -> tuple[Ratios, Labels, Mask]:
-    """Ratios of each material, labels of the pixels that agree, and those that may be left out."""
-    # A pixel that takes a rapid object for the background has an energy beyond all others'.
+    """Ratios of each material, labels of agreeing pixels, and pixels that may be left out."""
+    # A pixel that takes a rapid object for the background has by far the largest energy.
     measured = np.isfinite(survey.emissivity) * 1.0
     sound = np.where(measured > 0, labels, -1)
     ratio_set = ratios.estimate(sound, count, survey, noise, even=True)
@@ -151,19 +144,17 @@ def _sound(labels: Labels, count: int, survey: Survey, noise: Array) -> tuple[Ra
 def _common(
     image: Image, labels: Labels, sound: tuple[Ratios, Labels, Mask], survey: Survey, noise: Array
 ) -> tuple[Common, Labels]:
-    """Ratios of all pixels with their gradients, and labels of the pixels that agree with them.
-
-    Along a gradient those far from its middle are no outliers, and the scatters, which are added,
-    have one axis only if it is taken out. Where few pixels have an emissivity alone, a selection by
-    their ratios, no gradient is told. A degree more in each round, for what goes through the
-    middle alone leads astray beyond it.
-    """
+    """Ratios of all pixels with their gradients, and labels of the pixels that agree with them."""
     ratio_set, used, most = sound
+    # Few pixels with an emissivity alone, a selection by their ratios, tell no gradient.
     seen = np.where(most, used, -1)
     common, uneven = ratios.graded(image, seen, ratio_set, survey, noise)
     if not np.any(uneven):
         return common, used
     common, _ = ratios.graded(image, seen, ratio_set, survey, noise, limit=1)
+    # Along a gradient pixels far from its middle are no outliers, and the scatters, which are
+    # added, have one axis only without the gradient. A degree more in each round: pixels near the
+    # middle alone would lead astray beyond it.
     for degree in range(2, _ROUNDS + 2):
         local = common.select_pixels(image.surveyed)
         used = np.where(uneven[labels], labels, used)
@@ -247,7 +238,7 @@ def _graded(
 def regrouped(
     inputs: Inputs, materials: Callable[[Inputs], Material | None], regroup: Regroup | None
 ) -> tuple[Inputs, Material | None]:
-    """Inputs, and what is told of their materials; of others, if that regroups them."""
+    """Inputs, and the estimates of their materials, after a regrouping if the first ask for it."""
     material = materials(inputs)
     labels = None if regroup is None else regroup(material)
     if labels is None or np.all(labels == inputs.labels):
@@ -259,18 +250,12 @@ def regrouped(
 def hold(
     per_pixel: xr.Dataset, pooled: xr.Dataset, labels: xr.DataArray, *, apart: bool = True
 ) -> None:
-    """Replace pooled values, or widen their deviations, where they contradict the pixel alone.
-
-    A pixel alone has the ratio that its own changes show, with errors of how the cameras are
-    paired, or of what is mixed at an edge, in it; at its material's ratio these are in the object.
-
-    It stays alone without a label, where only so it has no flag, and where most of its material is
-    gray when pooled; of cameras `apart` also where pooling hardly makes its ratio more certain.
-    Else D times its variance alone is added, with D the mean square of the objects' difference in
-    deviations alone, of it or those around, if that is no chance, or at a border; `apart` also if
-    it stays alone. At one place not if most moving pixels of the material are gray alone.
-    """
+    """Replace pooled values, or widen their deviations, where they contradict the pixel alone."""
+    # A pixel alone has the ratio of its own changes, with errors of the cameras' pairing or of
+    # mixing at an edge; at its material's ratio these errors are in the object.
     sound, valid = (result["status"].values == 0 for result in (per_pixel, pooled))
+    # A pixel stays alone without a label, where only so it has no flag, where most of its material
+    # is gray, and of cameras apart where pooling hardly makes its ratio more certain.
     stay = sound & (~valid | (labels.values < 0))
     if apart:
         ratios = [result["reflection_ratio_std"].values for result in (pooled, per_pixel)]
@@ -280,9 +265,11 @@ def hold(
     gray_alone, still = ((per_pixel["status"].values & flag) != 0 for flag in flags)
     stay |= _share(labels.values, gray) > _MOSTLY
     common, single = sound & valid & ~stay, per_pixel["object_temperature_std"].values
+    # At one place nothing is added if most moving pixels of the material are gray alone.
     if not apart:
         common &= _share(np.where(still, -1, labels.values), gray_alone) <= _MOSTLY
     films = [result["object_temperature"].values for result in (pooled, per_pixel)]
+    # Mean square D of the objects' difference, in deviations of the pixel alone.
     square, variance = np.zeros((2, *common.shape))
     every = slice(None, None, max(1, len(single) // _FRAMES))
     for row, columns in enumerate(sound & valid):
@@ -291,10 +278,12 @@ def hold(
         square[row, columns] = np.nanmean(((value - lone) / std) ** 2, axis=0)
         variance[row, columns] = np.nanmean(std**2, axis=0)
         release()
+    # Of cameras apart, pixels that stay alone have their deviations widened, too.
     unlike = np.where(stay & apart & (square > _MORE), square, 0.0)
     local = np.where(common, _neighbour_mean(square, common), 0.0)
     whole, size = median_filter(labels.values, _SINGLE, mode="nearest"), 1 + 2 * _REACH
     border = minimum_filter(whole, size) < maximum_filter(whole, size)
+    # D times the variance alone is added if D of the pixel or around is no chance, or at a border.
     more = common & (border | (square > _MORE) | (local > _MORE_AROUND))
     square = np.where(more, np.maximum(square, local), 1.0 * (stay & sound))
     mean = _neighbour_mean(square * variance, common | (stay & sound))
@@ -315,7 +304,7 @@ def hold(
 
 
 def _share(labels: Array, holds: Mask) -> Array:
-    """Share (y, x) of the pixels of each one's material for which something holds; 0 without."""
+    """Share (y, x) of each pixel's material for which a condition holds; 0 without a material."""
     numbers = np.unique(labels, return_inverse=True)[1].ravel()
     share = np.bincount(numbers, holds.ravel()) / np.bincount(numbers)
     return np.where(labels >= 0, share[numbers].reshape(labels.shape), 0.0)

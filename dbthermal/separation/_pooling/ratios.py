@@ -13,7 +13,7 @@ from dbthermal.separation._tiles import Pixels, Survey
 
 _OUTLIER_SIGMAS: Final = 4.0  # deviations beyond which a pixel is not of the material
 _ORDER_SIGMAS: Final = 3.0  # deviations beyond which ratios at two orders differ not by chance
-# Energy along the axis from which there is one: deviations of the noise's, and share of it [1].
+# Least energy along an axis: in deviations of the noise's energy, and as a share of it [1].
 _ENERGY_SIGMAS: Final = 8.0
 _LEAST_ENERGY: Final = 0.01
 
@@ -44,8 +44,8 @@ class Common(Pixels):
     """Ratios of each pixel by its material."""
 
     ratio: Array  # (band, pixel) [1]
-    variance: Array  # of them, common to neighbours (pixel) [1/K^2]
-    spread: Array  # of single pixels about them (pixel) [1/K^2]
+    variance: Array  # of the ratios, common to neighbours (pixel) [1/K^2]
+    spread: Array  # of single pixels about the ratios (pixel) [1/K^2]
 
 
 def total(labels: Labels, values: Array, count: int) -> Array:
@@ -60,23 +60,19 @@ class Ratios:
 
     ratio: Array  # (band, material) [1]
     variance: Array  # (material) [1/K^2]
-    rapid: Mask  # at the largest order, not at those of the pixels (material)
+    rapid: Mask  # ratio taken at the largest order, not at the pixels' orders (material)
 
     def common(self, labels: Labels) -> Common:
-        """Ratios of pixels of given labels (pixel,), as far as they have one."""
+        """Ratios of pixels by their labels (pixel,)."""
         return Common(self.ratio[:, labels], self.variance[labels], np.zeros(labels.size))
 
 
 def estimate(
     labels: Labels, count: int, survey: Survey, noise: Array, *, even: bool = False
 ) -> Ratios:
-    """Ratios of the summed scatters at the order of each pixel, or the largest if that hides any.
-
-    What fewer functions than those would change, beyond noise, is a variance; and where the largest
-    order tells nothing, what the pixels' orders may hide. With `even` weights few pixels of much
-    energy do not turn the axis: they are to be found as outliers.
-    """
+    """Ratios of scatters summed at each pixel's order, or the largest where a curve may hide."""
     scatters = [*zip(survey.scatter, survey.frames, strict=True)]
+    # Few pixels of much energy do not turn the axis: they are to be found as outliers.
     if even:
         scatters = [_even(labels, count, *scatter) for scatter in scatters]
     at_order, fewer, most = (_at_order(labels, count, *scatter, noise) for scatter in scatters)
@@ -91,15 +87,15 @@ def estimate(
     # The largest order is less certain, and taken if the curve may turn the ratio of the material.
     rapid |= resolved & ~(hidden < _OUTLIER_SIGMAS**2 * variance)
     ratio, variance = (np.where(rapid, *pair) for pair in zip(most, at_order, strict=True))
+    # What fewer functions change, beyond noise, is a variance; and where the largest order tells
+    # nothing, what the pixels' orders may hide.
     excess = np.where(rapid, _excess(fewer, most, error), 0.0)
     return Ratios(ratio, variance + np.where(resolved, excess, hidden), rapid)
 
 
 def _even(labels: Labels, count: int, scatter: Array, frames: Array) -> tuple[Array, Array]:
-    """Scatters and their frames, of about the same energy in all pixels of a material.
-
-    Their sum is the spatial sign covariance (Locantore et al. 1999, doi:10.1007/BF02595862).
-    """
+    """Scatters and their frames, of about the same energy in all pixels of a material."""
+    # Their sum is the spatial sign covariance (Locantore et al. 1999, doi:10.1007/BF02595862).
     energy = np.einsum("bbp->p", scatter) + len(scatter) * frames
     inverse = np.where(frames > 0, 1.0 / energy, 0.0)
     number = total(labels, np.where(frames > 0, 1.0, 0.0), count)
@@ -127,12 +123,10 @@ def _at_order(
 
 
 def _excess(smaller: tuple[Array, Array], larger: tuple[Array, Array], error: Array) -> Array:
-    """Square of the difference of ratios at two orders beyond chance [1/K^2], over their error.
-
-    The estimate at the smaller order is the more certain one, and their difference has the
-    difference of their variances (Hausman 1978, doi:10.2307/1913827).
-    """
+    """Square of the difference of ratios at two orders beyond chance [1/K^2], over their error."""
     square = np.max((smaller[0] - larger[0])[1:] ** 2 / error, axis=0)
+    # The smaller order is the more certain: the difference has the difference of their variances
+    # (Hausman 1978, doi:10.2307/1913827).
     expected = np.abs(larger[1] - smaller[1])
     return np.where(square > _ORDER_SIGMAS**2 * expected, square - expected, 0.0)
 
@@ -140,12 +134,7 @@ def _excess(smaller: tuple[Array, Array], larger: tuple[Array, Array], error: Ar
 def outliers(
     labels: Labels, material: Ratios, common: Common, survey: Survey, noise: Array
 ) -> Mask:
-    """Pixels whose ratio, at the orders of their material, is not the common one.
-
-    Both by its own deviation, and by that of the material's ratio in the pixel: near black, pixels
-    that tell little have ratios of a wide and skew distribution. Those far off pull the ratio, and
-    go first: at least half as far as the farthest of the material.
-    """
+    """Pixels whose ratio, at the orders of their material, is not the common ratio."""
     rapid = material.rapid[labels]
     whitened = common.ratio / noise[:, np.newaxis]
     result = np.zeros(labels.shape, dtype=bool)
@@ -160,7 +149,10 @@ def outliers(
         score = np.where(labels >= 0, np.nan_to_num(score), 0.0)
         farthest = np.zeros(len(material.rapid))
         np.maximum.at(farthest, labels, score)
+        # Pixels far off pull the ratio, and go first: at least half as far as the farthest.
         distant = score > np.maximum(_OUTLIER_SIGMAS, 0.5 * farthest[labels])
+        # By the deviation of the material's ratio in the pixel, too: near black, pixels that tell
+        # little have ratios of a wide and skew distribution.
         result |= distant & ~reflection_ratio.agrees(whole, whitened)
     informed = np.isfinite(material.variance[labels])
     return np.asarray(result & informed & (survey.frames[0] > 0) & (labels >= 0))

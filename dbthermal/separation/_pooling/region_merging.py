@@ -38,11 +38,9 @@ class Features:
         return replace(self, values=self.values[places], variances=self.variances[places])
 
     def sums(self, cells: Labels) -> Array:
-        """Sums (4, feature, cell + 1) over cells of weight w, w f, w f^2, and the pixels' number.
-
-        The weight is the inverse variance, 0 without an estimate; pixels of no cell come first.
-        """
+        """Sums over cells (4, feature, cell + 1) of weight w, w f, w f^2, and number of pixels."""
         valid = np.isfinite(self.values) & np.isfinite(self.variances) & (self.variances > 0)
+        # The inverse variance, 0 without an estimate; pixels of no cell come first.
         weight = np.divide(1.0, self.variances, out=np.zeros_like(self.values), where=valid)
         values = np.where(weight > 0, self.values, 0.0)
         sums = (weight, weight * values, weight * values**2, weight > 0)
@@ -51,7 +49,7 @@ class Features:
 
 
 def mixed(cells: Labels, features: Features, error_rate: float) -> Mask:
-    r"""Cells (cell + 1,) whose pixels do not agree; of one material at most at the error rate.
+    r"""Cells (cell + 1,) whose pixels disagree; cells of one material only at the error rate.
 
     .. math:: \sum_p (f_p - \bar f)^2 / s_p^2 > \chi^2_{n - 1}(1 - \alpha / \mathrm{cells})
     """
@@ -79,21 +77,21 @@ class Regions:
     .. math:: T = \sum_f \frac{(\bar f_a - \bar f_b)^2}
         {\mathrm{var}(\bar f_a) + \mathrm{var}(\bar f_b) + (\epsilon_f \bar f)^2}
 
-    is chi-square over the features that both have, if they are of one material. Its limit is passed
-    with a probability of the error rate over three times the number of cells, than which a map has
-    fewer borders. The first feature is the one whose differences must be resolved. So many pixels
-    share an error of a feature that is not common to all.
+    is chi-square over the features that both have, if they are of one material. The first feature
+    is that whose differences must be resolved.
     """
 
     def __init__(
         self, cells: Labels, features: Features, error_rate: float, share: float = 1.0
     ) -> None:
         self._total, self._first, _, self._count = features.sums(cells)
+        # So many pixels share an error of a feature that is not common to all.
         for sums in (self._total, self._first):
             sums[~features.common] /= share
         self._common = features.common[:, np.newaxis, np.newaxis]
         self._tolerance = features.tolerance[:, np.newaxis]
         freedom = np.arange(features.common.size + 1)
+        # The error rate is divided over the borders, which are fewer than three for each cell.
         borders = 3 * self._total.shape[1]
         self._limits = chdtri(np.maximum(freedom, 1), error_rate / borders)
         self._parent = np.arange(self._total.shape[1])
@@ -107,7 +105,7 @@ class Regions:
         return cell
 
     def roots(self) -> Labels:
-        """Roots (cell + 1,) of all cells, that of no cell first."""
+        """Roots (cell + 1,) of all cells; the root of pixels without a cell comes first."""
         while np.any(self._parent != self._parent[self._parent]):
             self._parent = self._parent[self._parent]
         return self._parent.copy()
@@ -117,17 +115,15 @@ class Regions:
         return np.asarray(self._total[0] > 0)
 
     def compare(self, first: Labels, second: Labels) -> tuple[Array, Array]:
-        """Statistic over its limit, and resolution, of pairs (pair,) of regions by their roots.
-
-        The statistic is 0 where no feature can be compared. The resolution is the relative
-        difference of the first feature that would reach the limit, infinite where it is unknown.
-        """
+        """Statistic over its limit, and resolution, of pairs (pair,) of regions by their roots."""
         mean, variance, comparable = self.pooled(np.stack([first, second]))  # (feature, 2, pair)
         joint = np.all(comparable, axis=1)
         # var(f_a - f_b) = var(f_a) + var(f_b) + (epsilon f)^2
         total = variance.sum(axis=1) + (self._tolerance * mean.mean(axis=1)) ** 2
+        # The statistic is 0 where no feature can be compared.
         difference = np.where(joint, mean[:, 1] - mean[:, 0], 0.0)
         statistic = np.sum(difference**2 / np.where(joint, total, 1.0), axis=0)
+        # Resolution: relative difference of the first feature at the limit, infinite if unknown.
         visible = np.sqrt(self._limits[1] * total[0])
         size = np.where(joint[0], np.abs(mean[0].mean(axis=0)), 0.0)
         resolution = np.divide(visible, size, out=np.full_like(visible, np.inf), where=size > 0)
@@ -174,7 +170,7 @@ class Regions:
         return self._first[:, regions] / safe, pixels / safe, valid
 
     def _compare_one(self, first: int, second: int) -> tuple[float, float]:
-        """As `compare` of one pair: without arrays, for there are many."""
+        """Compare a pair of regions, as `compare` does, without arrays: there are many pairs."""
         statistic, features, resolution = 0.0, 0, np.inf
         for k, (total, sums) in enumerate(zip(self._total, self._first, strict=True)):
             if total[first] > 0 and total[second] > 0:
@@ -197,10 +193,7 @@ class Regions:
 
 
 def alike(first: Mask, second: Mask, ratios: Features, maps: Features) -> bool:
-    """Say that the ratios on both sides of a border (y, x) may be those of one material.
-
-    Where it mirrors nobody, the ratio is that of its emissivities: what changes is the object.
-    """
+    """Say that the ratios on both sides of a border (y, x) may be those of one material."""
     sound = np.all(np.isfinite(ratios.values) & (ratios.variances > 0), axis=0)
     sides = [sound & region for region in (first, second)]
     if not all(region.any() for region in sides):
@@ -216,6 +209,7 @@ def alike(first: Mask, second: Mask, ratios: Features, maps: Features) -> bool:
 
     if near(middle.mean(axis=0), middle[0], 0.5 * _UNLIKE):
         return True
+    # Where a side mirrors nobody, its ratio is that of emissivities: what changes is the object.
     for region, mean, opposite in zip(sides, middle, middle[::-1], strict=True):
         values = maps.values[-1, region]
         if np.isfinite(values).any():

@@ -17,16 +17,12 @@ from dbthermal.separation._subspace.method import METHOD, separate_smooth
 
 Threads = Callable[[Callable[[Any], None], Iterable[Any]], None]
 
-_SAMPLES: Final = 128  # at most; half of them at least, once they were as many
+_SAMPLES: Final = 128  # at most; once reached, half of them at least
 _TOGETHER: Final = 4  # tiles of pixels that a thread separates at once
 
 
 class History:
-    """Samples of both bands, each a mean of frames, and the maps of the pixels by them.
-
-    Without room for more they are joined in pairs, or the older half is forgotten where the newer
-    half is long enough.
-    """
+    """Samples of both bands, each a mean of frames, and the maps of each pixel from the samples."""
 
     def __init__(
         self, inputs: Inputs, status: Bits, gain: Planes, frames: int, timing: tuple[float, ...]
@@ -60,7 +56,7 @@ class History:
         last[...] = np.where(np.isnan(last), mean, last + added)
 
     def _make_room(self) -> None:
-        """Forget the older half of the samples, or join them in pairs."""
+        """Forget the older half of the samples if the newer is long enough, else join pairs."""
         half, samples, length = _SAMPLES // 2, self.samples, self._each * self._length
         if half * length >= self._memory:
             samples[:, :half], self._times = samples[:, half:], self._times[:, half:]

@@ -50,7 +50,7 @@ class Camera(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """Local polynomials over the means around one, from the narrowest to the widest."""
+    """Local polynomials over the means around a mean, from the narrowest to the widest."""
 
     weights: npt.NDArray[np.float64]  # of the means in value and slope (fit, 2, mean) [1, 1/s]
     ends: npt.NDArray[np.intp]  # first mean that has a weight, and the first after (fit, 2)
@@ -73,7 +73,7 @@ def camera(inputs: Inputs) -> tuple[Camera, Camera]:
 
 
 def _single(record: Any) -> Any:
-    """Record of numbers, and of tuples of them, in single precision."""
+    """Record of numbers and tuples of numbers in single precision."""
     if not isinstance(record, tuple):
         return np.float32(record) if isinstance(record, float) else record
     numbers = [_single(number) for number in record]
@@ -81,11 +81,8 @@ def _single(record: Any) -> Any:
 
 
 def fit(means: Array, centre: int, latency: int, interval: float, frames: Array) -> Fit:
-    """Local polynomials, from narrow to wide, over the means without a gap around a centre.
-
-    Of times [s] and segments of the means (2, mean), an interval [s] apart; the centre is the mean
-    of the frames' times (frame) [s]; the latency is in means.
-    """
+    """Local polynomials, from narrow to wide, over the means without a gap around a centre."""
+    # Times [s] and segments of the means, an interval [s] apart; the latency is in means.
     times, segments = means
     gap = (np.diff(times) > (1.0 + APART) * interval) | (np.diff(segments) > 0)
     interval_number = np.concatenate([[0], np.cumsum(gap)])
@@ -107,8 +104,8 @@ class Block(NamedTuple):
     """Frames of one mean, the maps of their pixels, and their temperatures."""
 
     frames: Planes  # (band, frame, y, x) [count]
-    means: Planes  # around them (mean, band, y, x) [count]
-    order: npt.NDArray[np.intp]  # places of these, by time
+    means: Planes  # around the frames (mean, band, y, x) [count]
+    order: npt.NDArray[np.intp]  # places of the means, by time
     maps: Planes  # ratio, its variance, emissivities, elements of their covariance (map, y, x)
     gain: Planes  # noise of the second band over that of a frame (y, x)
     status: npt.NDArray[np.uint32]  # (y, x)
@@ -121,10 +118,7 @@ ROWS: Final = (18, 5)
 
 @compiled
 def absorb(frames: Planes, mean: Planes, top: int, stop: int) -> None:
-    """Means (band, y, x) of frames (band, frame, y, x) [count] in some rows, in place.
-
-    Of the samples that are numbers in both bands; NaN of less than half.
-    """
+    """Means (band, y, x) of frames (band, frame, y, x) [count] in some rows, in place."""
     number = np.empty(frames.shape[3], np.float32)
     for y in range(top, stop):
         first, second = mean[0, y], mean[1, y]
@@ -132,6 +126,7 @@ def absorb(frames: Planes, mean: Planes, top: int, stop: int) -> None:
         for f in range(frames.shape[1]):
             _add(frames[0, f, y], frames[1, f, y], first, second, number)
         for x in range(number.size):
+            # NaN if less than half of the samples are numbers in both bands.
             count = number[x] if 2 * number[x] >= frames.shape[1] else _NAN
             first[x] /= count
             second[x] /= count
@@ -151,11 +146,7 @@ def _add(first: Any, second: Any, total: Any, second_total: Any, number: Any) ->
 def _fitted(
     means: Any, slopes: tuple[float, float], fit: Fit, w: Any, null: float, curve: Any
 ) -> float:
-    """Value and slope (band, 2) [K] of the widest fit that agrees with all narrower, in place.
-
-    Of means less the reference (band, mean) [count]. The variance of the null combination's value;
-    see `_windows`.
-    """
+    """Value and slope (band, 2) [K] of the widest fit that agrees with all narrower, in place."""
     low, high, variance, trial = -np.inf, np.inf, np.nan, curve[2:]
     for j in range(fit.variance.size):
         start, stop = fit.ends[j]
@@ -163,6 +154,7 @@ def _fitted(
             for power in range(2):
                 weights = fit.weights[j, power, start:stop]
                 trial[band, power] = kernels.dot(weights, means[band, start:stop]) / slopes[band]
+        # Null combination, whose variance is returned; see `_windows`.
         combined = w[0] * trial[0, 0] + w[1] * trial[1, 0]
         low, high = intersect(low, high, combined, null * fit.variance[j])
         if j > 0 and low > high:
@@ -295,11 +287,8 @@ def _terms(block: Block, fit: Fit, camera: Camera, y: int, x: int, work: Any) ->
 def emit(
     block: Block, fit: Fit, camera: Camera, single: Camera, scratch: Any, top: int, stop: int
 ) -> None:
-    """Films of the frames of one mean, and in the status the calibrated range, in place.
-
-    With the camera in double and in single precision; the scratch rows are separate arrays, so that
-    the compiler sees that none overlap.
-    """
+    """Films of the frames of one mean, and in the status the calibrated range, in place."""
+    # The scratch rows are separate arrays, so that the compiler sees that none overlap.
     line, out = scratch
     pairs = np.ones(2), np.empty(2), np.empty(2)
     work = line, np.empty((4, block.order.size)), np.empty((4, 2)), np.empty(7), pairs

@@ -142,7 +142,7 @@ class Stream:
         timing = self._block / frame_rate, memory, refresh
         inputs = replace(inputs, displacement=None)
         self._history = History(inputs, self._status, self._gain, self._block, timing)
-        # The frames that wait, and the means around them [count]; their times [s], and segments.
+        # The frames that wait, and the means around [count]; times [s], and segments of the means.
         self._frames = np.empty((half + 1, 2, self._block, *shape), np.float32)
         self._means = np.empty((int(kernels.WINDOWS[-1][0] + 1) * half + 1, 2, *shape), np.float32)
         self._frame_times = np.empty((half + 1, self._block))
@@ -282,7 +282,7 @@ class Stream:
         return self._filled == 0
 
     def _absorb(self) -> None:
-        """Take the full block: its mean into those of now and into the history."""
+        """Add the mean of the full block to the current means and to the history."""
         slot, place = self._blocks % len(self._frames), self._blocks % len(self._means)
         frames, mean, time = self._frames[slot], self._means[place], self._frame_times[slot].mean()
         self._apply(lambda rows: kernels.absorb(frames, mean, rows.start, rows.stop), self._rows)
@@ -303,7 +303,7 @@ class Stream:
         return times, block.films, block.status
 
     def _as_block(self, slot: int, order: npt.NDArray[np.intp]) -> kernels.Block:
-        """Frames of a slot, the means around them, the maps of now, and films without values."""
+        """Frames of a slot, the means around the frames, the current maps, and empty films."""
         films = np.empty((4, self._block, *self._shape), np.float32)
         pixels = self._history.maps, self._gain, self._history.status.copy(), films
         return kernels.Block(self._frames[slot], self._means, order, *pixels)

@@ -274,10 +274,10 @@ def _pattern(model: Model, work: Work) -> None:
 
 @inlined
 def judge(model: Model, work: Work, record: Any, sums: Array) -> None:
-    """Is the null residual noise? And its sums over blocks, with those of the object's curve."""
+    """Judge if the null residual is noise; sums of it and of the object's curve over blocks."""
     residual, rapid, coefficients = work.null_residual, work.rapid, work.coefficients
     count, w, frames = record.order + model.steps, work.null_weights, work.first.size
-    if model.stepless:  # the smooth curves of the object are those of the signals
+    if model.stepless:  # object and signals have the same smooth functions
         kernels.copy(work.target, residual)
     else:
         combined(w, coefficients, count, work.columns)
@@ -303,13 +303,10 @@ def judge(model: Model, work: Work, record: Any, sums: Array) -> None:
 def _unsteady(model: Model, record: Any, work: Work) -> tuple[float, float, bool]:
     r"""Autocorrelation, delay of the bands, and whether the residual is noise.
 
-    A band that is a frame late, or early, leaves the difference between two frames in the null
-    residual r, which is held against the first band's differences, a matched filter,
-    :math:`\sum_t r(t) \, (z_1(t \pm 1) - z_1(t)) + n \, w_1 s_1^2`; the last term takes out that r
-    holds the noise of :math:`z_1(t)`. A delay that changes sign, as after an interpolation between
-    frames, is seen in the energy of r in the frames at a change, over that of the noise: a
-    chi-square variable of few degrees of freedom, whose cube root is nearly normal (Wilson,
-    Hilferty 1931, doi:10.1073/pnas.17.12.684). The delay is the largest score in magnitude.
+    A band that is a frame late or early leaves the difference between two frames in the null
+    residual r. A matched filter shows it,
+    :math:`\sum_t r(t) \, (z_1(t \pm 1) - z_1(t)) + n \, w_1 s_1^2`, whose last term takes out that
+    r holds the noise of :math:`z_1(t)`.
     """
     residual, rapid, steep = work.null_residual, work.rapid, work.spare
     frames, null, noise = residual.size, record.null_variance, work.noise[0]
@@ -331,11 +328,14 @@ def _unsteady(model: Model, record: Any, work: Work) -> tuple[float, float, bool
         steep[t] = 1.0 if abs(change) > limit else 0.0
     score = max(abs(late), abs(early)) / sqrt(null * changes) if null * changes > 0 else 0.0
     # Energy in the frames at a change.
+    # It shows a delay that changes sign, as after an interpolation between frames.
     count, at_changes = steep[0], steep[0] * residual[0] ** 2
     for t in range(1, frames):
         at = max(steep[t], steep[t - 1])
         count += at
         at_changes += at * residual[t] ** 2
+    # The cube root of a chi-square of few degrees of freedom is nearly normal (Wilson, Hilferty
+    # 1931, doi:10.1073/pnas.17.12.684).
     variance = 2.0 / (9.0 * max(count, 1.0))
     mean = at_changes / (null * count) if count > 0 else 1.0
     score = max(score, (mean ** (1.0 / 3.0) - (1.0 - variance)) / sqrt(variance))

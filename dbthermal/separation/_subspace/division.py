@@ -34,7 +34,7 @@ class Tree(NamedTuple):
 
     edges: Whole  # first frames of each piece, and the last one's end (piece, 2)
     columns: Whole  # number of its functions (piece)
-    chosen: Whole  # of these, by which is chosen (piece)
+    chosen: Whole  # number of functions by which pieces are chosen (piece)
     places: Whole  # of its first function among the values (piece)
     values: Array  # of functions: at the frames, or their products with those of both halves
     held: Whole  # of its first product among those of a pixel, and the last one's end (piece)
@@ -56,7 +56,7 @@ class Scratch(NamedTuple):
     least: Array  # cost of the best division of each piece (piece, axis)
     joined: joining.Scratch
     reached: Whole  # pieces whose halves may be used
-    axis: Array  # the same of one axis
+    axis: Array  # axes, weights and costs as above, of a single axis
     weight: Array
     cheapest: Array
     taken: Array  # axes of divisions (division, 2), costs, and the frames that pieces begin with
@@ -65,14 +65,10 @@ class Scratch(NamedTuple):
 
 
 def divide(white: Array, time: Array, segment: Whole | None, stated: Array) -> tuple[Mask, Array]:
-    """Divisions by which two different axes explain signals (2, time, pixel) with noise of 1 best.
-
-    Whether a piece begins with a frame (2, time, pixel), and the cost (2, pixel) (eq. 12). The
-    second one is that of the other line, and costs more, infinitely if there is none. The axis of a
-    material may be `stated` (2, pixel), NaN for others.
-    """
+    """Two divisions by axes that explain signals (2, time, pixel) of unit noise best, and costs."""
     tree = _tree(time.tobytes(), None if segment is None else segment.tobytes())
     frames, pixels = white.shape[1:]
+    # The axis of a material may be stated (2, pixel), NaN for other pixels.
     count, axes = len(tree.edges), len(tree.starts) + bool(np.isfinite(stated).any())
     scratch = Scratch(
         across=np.empty(frames),
@@ -92,6 +88,8 @@ def divide(white: Array, time: Array, segment: Whole | None, stated: Array) -> t
         costs=np.empty(pieces.AXES),
         begins=np.empty((pieces.AXES, frames), dtype=bool),
     )
+    # Whether a piece begins with a frame, and the cost (eq. 12). The second division is that of the
+    # other line, and costs more, infinitely if there is none.
     first, cost = np.empty((2, pixels, frames), dtype=bool), np.empty((2, pixels))
     rows = np.ascontiguousarray(white.transpose(2, 0, 1)), np.ascontiguousarray(stated.T)
     _divide(tree, *rows, scratch, first, cost)
@@ -127,15 +125,13 @@ _TOGETHER = 2048  # frames whose functions are made in one matrix, of their numb
 
 @lru_cache(maxsize=4)
 def _tree(times: bytes, events: bytes | None) -> Tree:
-    """Pieces of each level of halving, down to those whose polynomial is any curve.
-
-    From times [s] and numbers of shutter events before each frame, at which no piece begins.
-    """
+    """Pieces of each level of halving, down to those whose polynomial is any curve."""
     time = np.frombuffer(times)
     segment = np.zeros(time.size, np.intp) if events is None else np.frombuffer(events, np.intp)
     event = np.diff(segment, prepend=segment[0]) > 0
     levels = int(np.ceil(np.log2(time.size / smooth.PIECE_ORDER)))
     edges = np.round(np.linspace(0, time.size, 2**levels + 1)).astype(np.intp)
+    # No piece begins at a shutter event.
     for place in np.flatnonzero(event):
         edges[1:-1][edges[1:-1] == place] += 1
     bounds = [edges[:: 2 ** (levels - level)] for level in range(levels + 1)]
@@ -187,13 +183,11 @@ def _functions(time: Array, segment: Whole) -> tuple[Array, int]:
 
 
 def _values(bases: list[Array], i: int) -> Array:
-    """Functions (time, function) of a piece, one after another, as `_scatters` takes them.
-
-    On its halves they are combinations of theirs, but on the shortest.
-    """
+    """Functions (time, function) of a piece, one after another, as `_scatters` takes them."""
     basis, inner = bases[i], len(bases) // 2
     if i >= inner and basis.shape[0] == basis.shape[1]:  # any curve
         return np.empty(0)
+    # Combinations of the halves' functions, except on the shortest pieces.
     if 2 * i + 1 < inner:
         earlier, later = bases[2 * i + 1 : 2 * i + 3]
         basis = np.concatenate([earlier.T @ basis[: len(earlier)], later.T @ basis[len(earlier) :]])
@@ -213,11 +207,9 @@ def _axis(a: float, b: float, d: float) -> tuple[float, float, float]:
 
 @compiled
 def _scatters(tree: Tree, scratch: Scratch, white: Array) -> None:
-    """Scatter of each piece of signals (2, time), in place.
-
-    From the shortest upwards: energies and products follow from those of a piece's halves.
-    """
+    """Scatter of each piece of signals (2, time), in place."""
     inner, energy, products = len(tree.edges) // 2, scratch.energy, scratch.products
+    # From the shortest upwards: energies and products follow from those of a piece's halves.
     for i in range(len(tree.edges) - 1, -1, -1):
         start, stop = tree.edges[i]
         columns, free = tree.columns[i], tree.columns[i] < stop - start
@@ -341,7 +333,7 @@ def _pixel(tree: Tree, scratch: Scratch, white: Array, axis: Array, begins: Mask
 
 @compiled
 def _near(axis: Array, taken: Array, count: int, angle: float) -> bool:
-    """Compare an axis with those that are taken: is it within an angle [rad] of one."""
+    """Say whether an axis lies within an angle [rad] of an axis that is taken."""
     near = False
     for i in range(count):
         product = abs(axis[0] * taken[i, 0] + axis[1] * taken[i, 1])

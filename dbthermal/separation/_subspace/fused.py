@@ -70,10 +70,8 @@ class Solution(Pixels):
     sums: Array  # of the null residual and the object's curve (2, block, pixel), see `pieces` [K]
 
     def survey(self, sound: Mask, plain: Mask) -> Survey:
-        """Survey of the pixels whose model is sound, with emissivities of those without a flag.
-
-        A selection by the estimate itself would bias the sum over a material.
-        """
+        """Survey of the pixels whose model is sound, with emissivities of those without a flag."""
+        # A selection by the estimate itself would bias the sum over a material.
         return Survey(
             scatter=np.where(sound, self.scatter, 0.0),
             frames=np.where(sound, self.freedom, 0.0),
@@ -89,7 +87,7 @@ class Solution(Pixels):
 def _film(
     temperature: Array, variance: Array, model: Model, value: Any, std: Any
 ) -> tuple[Any, Any, Any]:
-    """A temperature and its deviation, NaN where useless; and what is wrong with them."""
+    """Temperature and deviation (time), NaN where useless; numbers lost, missing, out of range."""
     lost, missing, beyond, zero, unit = _ZERO, _ZERO, _ZERO, _ZERO, _ONE
     lowest, highest = np.float32(model.lowest), np.float32(model.highest)
     for t in range(temperature.size):
@@ -189,12 +187,10 @@ def _straighten(work: Work, bands: int, frames: int) -> None:
 
 @inlined
 def _scatters(model: Model, work: Work, record: Any, matrices: Any) -> None:
-    """Scatter less noise at the pixel's order and at two large ones, in place.
-
-    Without the bend that is too small to be seen in a pixel, but not in many; a pixel with the
-    emissivity of its material is not asked for its scatter.
-    """
+    """Scatter less noise at the pixel's order and at two large ones, in place."""
     bands, frames, orders = work.noise.size, work.first.size, len(work.scatter)
+    # The bend is too small to be seen in a pixel, but not in many; a pixel with the emissivity of
+    # its material is not asked for its scatter.
     if np.isnan(work.material[2]) and not _bent(work, frames):
         _straighten(work, bands, frames)
         pixel.scatter(model, work)
@@ -383,12 +379,7 @@ def solve(
     drift: float,
     divided: Iterable[tuple[Whole, smooth.Subspace]] | None = None,
 ) -> Solution:
-    """Steps 1 to 4, where it matters again on signals with proportional reflections.
-
-    With the limit of the background's `drift` [K]. Of all pixels, or in parts that have functions
-    of their own, with the same rising ones; one part after another is taken: of a long capture the
-    functions of all would be much memory.
-    """
+    """Steps 1 to 4 of all pixels, with the limit of the background's `drift` [K]."""
     shared, material = share(tile, functions, drift), tile.material
     bands, frames, pixels = tile.signals.shape
     materials = np.full((pixels, 5 + bands), np.nan)
@@ -403,6 +394,8 @@ def solve(
     signals = np.ascontiguousarray(tile.signals, dtype=np.float64)
     solved = Solved(films, record, vectors, matrices, sums)
     space = _work_space(frames, bands, len(shared.rising))
+    # Parts of the pixels may have functions of their own, with the same rising ones; part after
+    # part: of a long capture the functions of all would be much memory.
     for places, of_part in [(np.arange(pixels), functions)] if divided is None else divided:
         model, count = shared._replace(**_columns(of_part)), of_part.functions.shape[1]
         space["coefficients"], space["columns"] = np.empty((bands, count)), np.empty(count)

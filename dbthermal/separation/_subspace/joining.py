@@ -1,4 +1,4 @@
-r"""Pieces of time that are joined with those beside them, of one pixel, compiled.
+r"""Pieces of time that are joined with adjacent pieces, of one pixel, compiled.
 
 Halving makes more pieces than are needed: a change at a third of the time needs many. Of the ends
 of pieces at hand the best are found by going through them in their order. A signal is summed up in
@@ -99,16 +99,13 @@ def _powers(scratch: Scratch, number: int, end: float) -> None:
 
 @compiled
 def _add(scratch: Scratch, number: int, end: float, steps: int) -> float:
-    """Add a part to the equations of a piece that ends at a time [s], in place.
-
-    So many steps of the camera are behind the part: before them each is a constant. Returns the
-    energy that the piece leaves in addition.
-    """
+    """Add a part to the equations of a piece that ends at a time [s]; return the energy left."""
     matrix, right, row = scratch.equations, scratch.right, scratch.row
     energy, count = scratch.beside[number], pieces.FUNCTIONS + steps
     _powers(scratch, number, end)
     for j in range(pieces.FUNCTIONS):
         for k in range(count):
+            # A step of the camera that comes after the part is a constant over it.
             constant = scratch.powers[0, j]
             row[k] = scratch.powers[k, j] if k < pieces.FUNCTIONS else constant
         value = scratch.products[number, j]

@@ -47,7 +47,7 @@ _numbers: Final[Callable[..., Any]] = njit(fastmath=_FLAGS | {"nnan"}, **_OPTION
 
 
 class Table(NamedTuple):
-    """Response of a band, as polynomials of (temperature - middle) / half; exact beside them."""
+    """Response of a band: polynomials of (temperature - middle) / half; exact outside."""
 
     signal: tuple[float, ...]  # coefficients of u(T) - T_r [K], rising
     slope: tuple[float, ...]  # of u'(T) [1]
@@ -90,7 +90,7 @@ def response(rows: Array, band: int) -> Table:
 
 @lru_cache
 def table(curve: Curve, *second: Curve) -> Table:
-    """Polynomials of a response, of the least degree that keeps an error; of the others' range."""
+    """Polynomials of a response, of the least degree that keeps an error in all bands."""
     margin = _MARGIN * (curve.highest - curve.lowest)
     widest = np.array([max(curve.lowest - margin, 0.5 * curve.lowest), curve.highest + margin])
     for degree, share in _TRIED:
@@ -255,17 +255,15 @@ def mean(values: Array) -> float:
 
 @compiled
 def principal(matrix: Array, turned: Array, turns: Array, axis: Array) -> float:
-    """Largest eigenvalue of a symmetric matrix; its vector, of any length, in place.
-
-    Of two rows the vector is the longer of two expressions; of more they are turned in pairs until
-    the matrix is diagonal (Jacobi).
-    """
+    """Largest eigenvalue of a symmetric matrix; its vector, of any length, in place."""
     count = axis.size
+    # The longer of two expressions for the vector.
     if count == 2:
         a, b, d = matrix[0, 0], matrix[0, 1], matrix[1, 1]
         largest = 0.5 * (a + d) + sqrt(0.25 * (a - d) ** 2 + b * b)
         axis[0], axis[1] = (largest - d, b) if a >= d else (b, largest - a)
         return largest
+    # More rows are turned in pairs until the matrix is diagonal (Jacobi).
     for i in range(count):
         copy(matrix[i], turned[i])
         fill(turns[i], 0.0)
@@ -305,7 +303,7 @@ def _turn(turned: Array, turns: Array, p: int, q: int) -> None:
 
 @_numbers
 def range_of(values: Array) -> Any:
-    """Largest less smallest value; with a NaN any number, or these would be taken one by one."""
+    """Largest less smallest value; with a NaN any number, so that many are compared at once."""
     low, high = values[0], values[0]
     for t in range(values.size):
         low = min(low, values[t])

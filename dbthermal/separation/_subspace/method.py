@@ -120,11 +120,9 @@ class SubspaceSettings:
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def separate(tile: Tile, settings: SubspaceSettings) -> Estimate:
-    """Separate one tile of two bands or more.
-
-    A pixel keeps its division of the time from a pass before, unless it has a flag.
-    """
+    """Separate one tile of two bands or more."""
     functions, kept, drift = _functions(tile), tile.division, settings.background_drift
+    # A pixel keeps its division of the time from a pass before, unless it has a flag.
     if kept is None or not kept.any():
         return _searched(tile, functions, drift)
     places = np.flatnonzero(kept.any(axis=0))
@@ -195,7 +193,7 @@ def _report(tile: Tile, solution: Solution) -> Estimate:
     )
     result = result.check_range(tile.curves[0], not_estimated=FILMS)
     status = result.status
-    # The ratio of an object that is taken for the background is that of emissivities.
+    # An object that is taken for the background has the ratio of emissivities.
     exchanged = (status & np.uint32(Status.ROLES_MAY_BE_SWAPPED)) != 0
     exchanged &= (status & _HARDLY_CHANGES) != 0
     sound = ((status & BROKEN) == 0) & ~exchanged
@@ -219,7 +217,7 @@ def _flags(tile: Tile, solution: Solution) -> dict[Status, Mask]:
     # Before an object that hardly changes, what changes would be the background: comes and goes.
     resting = constant | (nonphysical & (solution.noise_variance > _UNKNOWN**2))
     swapped[resting] = ~pieces.returning(select(tile.signals[0], resting))
-    # Or along a ratio that is one of emissivities: of an object that is switched on and off.
+    # Or along a ratio of emissivities, as of an object that is switched on and off.
     emitted = np.all((solution.ratio > _EMITTED[0]) & (solution.ratio < _EMITTED[1]), axis=0)
     swapped |= constant & emitted
     # A reduced chi-square of f degrees of freedom has the standard deviation sqrt(2 / f).
@@ -264,7 +262,7 @@ def _searched(tile: Tile, functions: smooth.Subspace, drift: float) -> Estimate:
     cost = energy + (pieces.COST + further) * count  # of one smooth curve
     lowest = np.minimum(cost, costs.min(axis=0))
     for divided, price in zip(divisions, costs, strict=True):
-        # A sound explanation gives way to a cheaper one; one with a flag to any that is likely.
+        # A sound explanation gives way to a cheaper one; a flagged one to any that is likely.
         flagged = (best.status != 0) | (cost > lowest + _LIKELY)
         tried = (price < cost) | (flagged & (price < lowest + _LIKELY))
         # One piece is a smooth curve.
@@ -295,7 +293,7 @@ def _finished(tile: Tile, estimate: Estimate, first: Mask, functions: smooth.Sub
     """Estimate with its division, a survey by more functions of the pieces, and flags of jumps."""
     divided = np.asarray(first.any(axis=0))
     surveyed = divided & tile.surveyed
-    if tile.material is not None:  # one with its emissivity is not asked for a scatter
+    if tile.material is not None:  # pixels with its emissivity need no scatter
         surveyed &= np.isnan(tile.material.noise_variance)
     if surveyed.any():
         straight = _straight(tile.select_pixels(surveyed), estimate.select_pixels(surveyed))

@@ -1,7 +1,4 @@
-"""Pieces of time for an object that changes rapidly: which pixels ask for them, and their outcome.
-
-Which are best is found in `division`.
-"""
+"""Pieces of time for an object that changes rapidly: which pixels need them; see `division`."""
 
 from collections.abc import Iterable
 from functools import lru_cache
@@ -28,8 +25,8 @@ STARTS: Final = (0, 2, 3, 4, 5)
 ROUNDS: Final = 4
 # Axes that are refined, of which the two best are kept: joined, they may change places.
 AXES: Final = 4
-# Costs that differ by less are the same but for rounding: of two divisions the finer one is taken,
-# whose pieces may be joined, and of two ways to join pieces that of the longest.
+# Costs that differ by less are the same but for rounding: of two divisions the finer is taken,
+# whose pieces may be joined, and of two ways to join pieces the one with the longest pieces.
 TIE: Final = 1e-6
 APART: Final = 6.0  # standard deviations between two axes that are told apart
 
@@ -57,11 +54,8 @@ def blocks(frames: int) -> Whole:
 
 
 def asked(sums: Array, time: Array, variance: Array, used: Whole) -> Mask:
-    """Pixels whose smooth curve is described shorter in pieces.
-
-    Of the sums (2, block, pixel) [K] over `blocks` of a null residual and of the curve taken from
-    it, with noise of a variance (pixel) [K^2] and the number of functions used (pixel).
-    """
+    """Pixels whose smooth curve is described shorter in pieces."""
+    # Sums (block, pixel) [K] of the null residual and of the curve taken from it.
     (residual, curve), edges = sums, blocks(len(time))
     levels = int(np.log2(len(residual)))
     length = np.diff(edges)[:, np.newaxis]
@@ -86,16 +80,14 @@ def asked(sums: Array, time: Array, variance: Array, used: Whole) -> Mask:
 def outside(
     signals: Array, noise: Array, divided: Iterable[tuple[Whole, smooth.Subspace]]
 ) -> tuple[Array, Array]:
-    """Scatter (band, band, pixel) [1] outside the functions of parts less noise, and its freedom.
-
-    Of signals (pixel, band, time) [K], whitened by their noise (band, pixel) [K].
-    """
+    """Scatter (band, band, pixel) [1] outside the functions of parts, less noise, and freedom."""
     pixels, bands, frames = signals.shape
     scatter, freedom = np.empty((pixels, bands, bands)), np.empty(pixels)
     for places, of_part in divided:
         columns = np.ascontiguousarray(of_part.functions.T)
         _outside(columns, of_part.spans, signals, places, np.empty((bands, len(columns))), scatter)
         freedom[places] = frames - len(columns)
+    # Whitened by the noise (band, pixel) [K].
     whitened = scatter.transpose(1, 2, 0) / (noise[:, np.newaxis] * noise)
     return whitened - freedom * np.eye(bands)[..., np.newaxis], freedom
 
@@ -115,14 +107,11 @@ def _outside(
 
 
 def plane(signals: Array, noise: Array) -> tuple[Array, Array]:
-    """Combinations (2, time, pixel) of signals (band, time, pixel) with noise of 1, and their axes.
-
-    Object and background change more than two bands along two lines: of the whitened signals all
-    but the noise lies in one plane, with axes (2, band, pixel) [1]. Two bands are the plane.
-    """
+    """Combinations (2, time, pixel) of signals (band, time, pixel) with unit noise, and axes."""
     white = signals / noise[:, np.newaxis]
     if len(noise) == 2:
         return white, np.repeat(np.eye(2)[..., np.newaxis], signals.shape[2], axis=2)
+    # Object and background change the bands along two lines: all but the noise lies in a plane.
     changes = white - white.mean(axis=1, keepdims=True)
     scatter = np.einsum("btp,ctp->pbc", changes, changes)
     axes = np.linalg.eigh(scatter)[1][..., -2:].transpose(2, 1, 0)
@@ -130,11 +119,7 @@ def plane(signals: Array, noise: Array) -> tuple[Array, Array]:
 
 
 def null_energy(white: Array, functions: smooth.Subspace, axis: Array) -> tuple[Array, Whole]:
-    """Energy across the axis of rapid changes of a `plane` (2, time, pixel), and functions used.
-
-    Of the functions that the lowest information criterion selects, and one more; across a known
-    `axis` (2, pixel) where it is not NaN.
-    """
+    """Energy across the axis of rapid changes of a `plane`, and the number of functions used."""
     held = np.einsum("tf,btp->bfp", functions.functions, white, optimize=True)
     pairs = ((0, 0), (0, 1), (1, 1))
     a, b, d = (
@@ -144,8 +129,10 @@ def null_energy(white: Array, functions: smooth.Subspace, axis: Array) -> tuple[
     )
     principal = 0.5 * (a + d) - np.sqrt(0.25 * (a - d) ** 2 + b * b)
     pooled = axis[1] ** 2 * a - 2.0 * axis[0] * axis[1] * b + axis[0] ** 2 * d
+    # Across a known axis (2, pixel) where it is not NaN.
     energy = np.where(np.isnan(pooled), principal, pooled)
     frames, orders = white.shape[1], len(energy)
+    # The functions that the lowest information criterion selects, and one more.
     criterion = frames * np.log(np.maximum(energy, reflection_ratio.TINY))
     criterion += np.arange(1, orders + 1)[:, np.newaxis] * np.log(frames)
     lowest = min(reflection_ratio.LOWEST_ORDER, orders - 1)
@@ -154,32 +141,28 @@ def null_energy(white: Array, functions: smooth.Subspace, axis: Array) -> tuple[
 
 
 def returning(signal: Array) -> Mask:
-    """Pixels of a signal (time, pixel) that falls again by most of what it rose, or the reverse.
-
-    Of means over parts of the capture: their total variation over their range is 1 for a change
-    that stays, 2 for one that comes and goes.
-    """
+    """Pixels of a signal (time, pixel) that falls again by most of what it rose, or the reverse."""
     stretches = np.array_split(signal, min(_PARTS, len(signal)))
     means = np.stack([stretch.mean(axis=0) for stretch in stretches])
+    # Total variation over range: 1 for a change that stays, 2 for one that comes and goes.
     variation = np.abs(np.diff(means, axis=0)).sum(axis=0)
     return np.asarray(variation > _RETURNED * np.ptp(means, axis=0))
 
 
 def sudden(curve: Array, std: Array, time: Array) -> Mask:
-    """Pixels of which a curve (time, pixel) [K] steps from one frame to the next.
-
-    By more than most of its change within a second, and its deviations; not over a pause.
-    """
+    """Pixels of which a curve (time, pixel) [K] steps from one frame to the next."""
     interval = np.diff(time)
     usual = float(np.median(interval))
     # A clock of bursts has a median far below its mean.
     frames = min(time.size, max(3, 2 * int(np.ceil(0.5 * _AROUND / usual))))
     step = np.abs(np.diff(curve, axis=0))
     noise = np.sqrt(std[1:] ** 2 + std[:-1] ** 2)
+    # By more than its deviations, and not over a pause.
     jumps = (step > bars.CHANGE * noise) & (interval < 2.0 * usual)[:, np.newaxis]
     result = np.any(jumps, axis=0)
-    jumping, size = curve[:, result], (frames, 1)  # of the others the surroundings say nothing
+    jumping, size = curve[:, result], (frames, 1)  # smooth pixels need no surroundings
     change_around = maximum_filter(jumping, size)[1:] - minimum_filter(jumping, size)[1:]
+    # By more than most of its change within a second.
     result[result] = np.any(jumps[:, result] & (step[:, result] > _MOST * change_around), axis=0)
     return np.asarray(result)
 

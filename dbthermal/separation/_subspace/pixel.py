@@ -32,8 +32,8 @@ class Model(NamedTuple):
     object_part: Array  # (column, time)
     spans: Whole  # first frames of these functions, and the ends (column, 2)
     rising: Array  # (degree, time)
-    whole: Whole  # of these (degree, 2)
-    spread: float  # of the first of these
+    whole: Whole  # first frames of the rising functions, and the ends (degree, 2)
+    spread: float  # range of the first rising function
     leverage: Array  # (order, time)
     steps: int
     stepless: bool  # no function has a step of the camera: both are the same
@@ -50,7 +50,7 @@ class Model(NamedTuple):
 
 
 class Work(NamedTuple):
-    """Signals and curves (time) of one pixel, and of some as they are read and written."""
+    """Signals and curves (time) of one pixel, and blocks of pixels that are read and written."""
 
     first: Array  # signal of the first band [K]
     target: Array  # null combination of the bands, smoothed (eq. 5)
@@ -112,12 +112,6 @@ class Line(NamedTuple):
 def ratios(model: Model, work: Work, record: Any) -> None:
     r"""Step 1; coefficients, ratios and null combination in place, and how well they are known.
 
-    The order is that of the lowest Bayesian information criterion (Schwarz 1978,
-    doi:10.1214/aos/1176344136) of the energy across the axis, **plus one**: a part of the object's
-    curve too small to be significant there still biases the ratio to first order, while one
-    function more costs little variance. A material's ratios are used unless the pixel's own rapid
-    changes contradict them by four standard deviations.
-
     With S the background's energy in the first band, n = N - K degrees of freedom, and
     :math:`|v|^2 = \sum \kappa_m^2 / s_m^2`, the variance of the ratios is that of eq. 4 with
     :math:`\sigma^2 = 1 / S + n / (S^2 |v|^2)` (Fuller 1987, doi:10.1002/9780470316665). The first
@@ -127,6 +121,7 @@ def ratios(model: Model, work: Work, record: Any) -> None:
     bands, orders, frames = noise.size, len(work.scatter), work.first.size
     scatter(model, work)
     pooled, along = False, work.material_axis
+    # A material's ratios are used unless the pixel's rapid changes contradict them by 4 sigma.
     if not np.isnan(material[6]):
         length = 0.0
         for m in range(bands):
@@ -220,16 +215,19 @@ def _across(scatter: Array, work: Work, pooled: float) -> float:
 
 @inlined
 def _order(work: Work, pooled: float, frames: int) -> int:
-    """Order less one of the lowest information criterion, see `ratios`."""
+    """Order less one: that of the lowest information criterion, plus one."""
     scatter = work.scatter
     lowest = min(reflection_ratio.LOWEST_ORDER, len(scatter) - 1) - 1
     # N ln E + K ln N is least where E N^(K / N) is.
+    # Of the energy across the axis (Schwarz 1978, doi:10.1214/aos/1176344136).
     best, least, price, step = lowest, np.inf, 1.0, frames ** (1.0 / frames)
     for order in range(lowest, len(scatter) - 1):
         criterion = price * max(_across(scatter[order], work, pooled), reflection_ratio.TINY)
         price *= step
         if criterion < least:
             best, least = order, criterion
+    # Plus one: a part of the object's curve too small to be significant still biases the ratio to
+    # first order, while one function more costs little variance.
     return best + 1 if len(scatter) > 1 else 0
 
 
@@ -269,7 +267,7 @@ def may_be_gray(model: Model, record: Any, work: Work) -> bool:
 
 @inlined
 def _chance(statistic: float, freedom: int) -> float:
-    """Chance of a larger chi-square: of two degrees of freedom less, and one more term."""
+    """Chance of a larger chi-square, as a sum of terms that add two degrees of freedom each."""
     half, odd = 0.5 * statistic, freedom % 2
     chance, power = erfc(sqrt(half)) if odd else exp(-half), 0.5 if odd else 1.0
     term = exp(-half) * (2.0 * sqrt(half / np.pi) if odd else half)

@@ -21,18 +21,15 @@ ANNEALING: Final = 0.7
 STARTING_STEPS: Final = 5
 STARTING_POINTS: Final = 128
 STEPS: Final = 3
-# Largest correlation of neighbouring residuals: that of one all slow would be 1.
+# Largest correlation of neighbouring residuals: a wholly slow residual would have 1.
 MOST_CORRELATED: Final = 0.98
 _GUESSES: Final = 60  # of the value of a rank, at most
 
 
 @compiled
 def ranked(values: npt.NDArray[np.float32], rank: int, guess: float) -> float:
-    """Value of a rank, from 0, of values that are not negative, from a guess: no sorting.
-
-    By interpolation between the numbers of values below two others. The bits of such numbers, as
-    whole numbers, are in the same order, and NaN above all.
-    """
+    """Value of a rank, from 0, of values that are not negative, from a guess: no sorting."""
+    # The bits of such values, as whole numbers, are in the same order, and NaN above all.
     bits = values.view(np.uint32)
     least, most = np.float32(0.0), np.float32(values.size)
     low, high = np.float32(0.0), np.float32(np.inf)
@@ -53,6 +50,7 @@ def ranked(values: npt.NDArray[np.float32], rank: int, guess: float) -> float:
         elif turn % 3 == 2:
             middle = np.float32(0.5) * (low + high)
         else:
+            # Interpolated between the numbers of values below two bounds.
             share = (goal + np.float32(0.5) - least) / (most - least)
             middle = low + share * (high - low)
         if not low < middle < high:
@@ -113,14 +111,9 @@ def reweighted(x: Any, y: Any, slope: Any, intercept: Any, scale: float) -> Any:
 
 @compiled
 def _started(x: Array, y: Array, noise: float, few: Any) -> tuple[float, float]:
-    """Slope and intercept of the best of three starts: all points, those above, those below a line.
-
-    Disturbances of a resting background lie mostly on one side of it, and one of the halves is
-    then nearly free of it. Each start closes in on the densest half of the points by a scale that
-    is a fraction of the deviation; the one with the smallest deviation wins. Some points in single
-    precision, about their mean, are enough to start from.
-    """
+    """Slope and intercept of the best of three starts: all points, points above, below a line."""
     middle, centre = kernels.mean(x), kernels.mean(y)
+    # Some points in single precision, about their mean, are enough to start from.
     count = min(x.size, STARTING_POINTS)
     xs, ys, weights = few[0, :count], few[1, :count], few[2, :count]
     plain, magnitude = few[3, :count], few[4, :count]
@@ -132,12 +125,15 @@ def _started(x: Array, y: Array, noise: float, few: Any) -> tuple[float, float]:
         plain[i] = ys[i] - intercept - slope * xs[i]
     rank, zero = int(SHARE * count), np.float32(0.0)
     best, best_slope, best_intercept = np.inf, np.inf, np.inf
+    # Disturbances of a resting background lie mostly on one side of it: half of the points is
+    # then nearly free of disturbances. The start with the smallest deviation wins.
     for start in range(3):
         sign = np.float32(2 * start - 3) if start > 0 else zero
         for i in range(count):
             weights[i] = 1.0 if sign * plain[i] >= zero else 0.0
         slope, intercept, _ = moments(xs, ys, weights)
         deviation = 0.0
+        # Close in on the densest half of the points, by a scale of a fraction of the deviation.
         for turn in range(STARTING_STEPS):
             if turn > 0:
                 scale = max(noise, ANNEALING * TO_STD * deviation)
@@ -157,16 +153,14 @@ def _started(x: Array, y: Array, noise: float, few: Any) -> tuple[float, float]:
 def regress(
     x: Array, y: Array, noise: float, weights: Array, residual: Array, few: Any, again: int
 ) -> tuple[float, float, float, float]:
-    r"""Robust line of Tukey's bisquare weights: slope, its variance, scale, energy of abscissa.
+    """Robust line of Tukey's bisquare weights: slope, its variance, scale, energy of abscissa.
 
     Iteratively reweighted least squares (Beaton and Tukey 1974, doi:10.1080/00401706.1974.10489171)
     with :math:`w = (1 - (r / c s)^2)^2` inside :math:`c s` and 0 outside. The scale s is the
     absolute deviation of rank 30 %, as a standard deviation, renewed at every step and never below
-    the `noise` of the ordinate. It starts from weights of nearly the same points, or anew.
-
-    With residuals of lag-one correlation :math:`\rho` only :math:`(1 - \rho) / (1 + \rho)` of
-    the points are independent; the variance is divided by it. Residual and weights are in place.
+    the `noise` of the ordinate. Residual and weights are in place.
     """
+    # From weights of nearly the same points, or anew.
     if again:
         slope, intercept, energy = moments(x, y, weights)
     else:
@@ -192,22 +186,20 @@ def regress(
         kept += one * one
         lagged += one * residual[t - 1] * weights[t - 1]
     correlation = min(max(lagged / kept if kept > 0 else 0.0, 0.0), MOST_CORRELATED)
+    # Of residuals of lag-one correlation rho only (1 - rho) / (1 + rho) of the points count.
     independent = (1.0 - correlation) / (1.0 + correlation)
     return slope, scale**2 / energy / independent, scale, energy
 
 
 def lines(abscissa: Array, ordinate: Any, noise: float) -> tuple[Array, Array, Array, Array]:
-    """Robust lines of an ordinate z on an abscissa (time, pixel), see `regress`.
-
-    Slopes, their variances and energies of the abscissa (pixel), and the weights k (time, pixel) of
-    the ordinate in the slope, sum k z.
-    """
+    """Slopes, variances, energies (pixel), weights (time, pixel) of robust lines, see `regress`."""
     frames, pixels = abscissa.shape
     rows = [np.ascontiguousarray(values.T, np.float64) for values in (abscissa, ordinate)]
     weights, numbers = np.empty((pixels, frames)), np.empty((3, pixels))
     work = np.empty(frames), np.full((5, frames), np.inf, np.float32)
     _lines(*rows, float(noise), weights, *work, numbers)
     slope, variance, energy = numbers
+    # Weights k of the ordinate z in the slope, sum k z.
     kernel = weights.T * abscissa
     kernel -= weights.T * (kernel.sum(axis=0) / weights.T.sum(axis=0))
     return slope, variance, energy, kernel / energy
