@@ -24,7 +24,7 @@ from dbthermal.alignment._reflections import seen_apart, shift_of
 from dbthermal.alignment._resampling import STEP, on_one_clock
 from dbthermal.schema import Status
 
-_PIXELS, _FRAMES = 20_000, 400  # of means in which clocks and shift are estimated, at most
+_PIXELS, _FRAMES = 20_000, 400  # of the capture of means that gives clocks and shift, at most
 _COMMON: Final = 0.5  # share of a square's pixels that a frame must have
 _ROUNDS, _VAIN = 8, 2  # clocks that are tried, at most, and in a row without improvement
 _LATE: Final = 0.02  # difference below which clocks are the same [frame]
@@ -159,10 +159,7 @@ def _explains_more(rival: xr.Dataset, field: xr.Dataset) -> bool:
 def _clocked(
     small: xr.Dataset, scale: Scale, synchronous: xr.DataArray, resample: Callable[..., xr.Dataset]
 ) -> tuple[xr.DataArray, xr.Dataset | None, float, list[xr.Dataset]]:
-    """Offsets of the clocks, the shift of the reflections, and the clocks' uncertainty [s].
-
-    And the shifts at all offsets that were tried.
-    """
+    """Offsets of the clocks, shift of the reflections, uncertainty [s], shifts of all trials."""
     names, trials = small["band"].values, list[_Trial]()
 
     def compare_at(**clock: Any) -> tuple[xr.DataArray, xr.Dataset | None]:
@@ -183,7 +180,7 @@ def _clocked(
         if not synchronous_trials or (trial := _next(synchronous_trials, frame)) is None:
             raise
         offset, field = compare_at(offset=trial)
-    while trials and field is trials[-1].field:  # the last one told a delay
+    while trials and field is trials[-1].field:  # the last trial has a delay
         if (trial := _next(trials, frame)) is None:
             break
         offset, field = compare_at(offset=trial)

@@ -150,14 +150,12 @@ def _curves(view: xr.DataArray, bad: Mask) -> Array:
 
 
 def _smooth(signal: Array) -> Array:
-    """Fit smooth curves to signals (time, pixel), by Tukey's bisquare weights, at a few times.
-
-    A plain mean holds a share of passing reflections, different in each band, which displaces a
-    warm spot without detail by 0.2 pixel.
-    """
+    """Fit smooth curves to signals (time, pixel), by Tukey's bisquare weights, at a few times."""
     order = min(_ORDER, len(signal))
     functions = polynomial_basis(np.arange(len(signal)), order)
     products = np.einsum("ti,tj->tij", functions, functions).reshape(len(signal), -1)
+    # A plain mean holds a share of passing reflections, different in each band, which displaces a
+    # warm spot without detail by 0.2 pixel.
     weights = np.ones_like(signal)
     for _ in range(_ROBUST_STEPS):
         matrix = (weights.T @ products).reshape(-1, order, order)

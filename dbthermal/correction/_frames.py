@@ -83,13 +83,11 @@ class Findings:
 
 
 def sampling(counts: xr.DataArray) -> dict[str, slice]:
-    """Rows and columns of counts (band, time, y, x) that are looked at.
-
-    Whole rows, for the detail from pixel to pixel, but in a capture too long for 24 of them.
-    """
+    """Rows and columns of counts (band, time, y, x) that are looked at."""
     shape = counts.sizes["y"], counts.sizes["x"]
     wanted = min(_PIXELS, _SAMPLES // counts.sizes["time"])
     step = stride(shape, wanted)
+    # Whole rows, for the detail from pixel to pixel, but in a capture too long for 24 of them.
     rows = -(-shape[0] * shape[1] // wanted)
     whole = wanted >= _ROWS_AT_LEAST * shape[1] or step == 1
     steps = {"y": rows, "x": 1} if whole else {"y": step, "x": step}
@@ -178,11 +176,7 @@ def _noise(film: Film) -> float:
 
 
 def _runs(film: Film, limit: np.float32, longest: int) -> Iterator[tuple[int, int, list[int]]]:
-    """Yield first frames, and frames after the last, of unpredicted runs, by length.
-
-    And the frames that prove it: in the middle, and on both sides. At an end of the capture one
-    twice as far away stands for the missing side.
-    """
+    """Yield start and stop of unpredicted runs, by length, and the frames that prove each."""
     changes = [_changed(before, after, limit) for before, after in pairwise(film)]
     edges = (1 + np.flatnonzero(np.array(changes) > _EDGE)).tolist()
     pairs = [(0, stop) for stop in edges[:_ENDS] if stop <= _AT_END]
@@ -191,6 +185,8 @@ def _runs(film: Film, limit: np.float32, longest: int) -> Iterator[tuple[int, in
         pairs += [(start, stop) for stop in ends if stop - start <= longest]
         pairs += [(start, len(film))] if len(film) - start <= _AT_END else []
     for start, stop in sorted(pairs, key=lambda pair: pair[1] - pair[0]):
+        # Compare the middle with both sides; at an end of the capture a frame twice as far away
+        # stands for the missing side.
         before = start - 1 if start > 0 else 2 * stop
         after = stop if stop < len(film) else 2 * start - stop - 1
         places = [(start + stop - 1) // 2, before, after]
@@ -224,11 +220,9 @@ def _changed(before: Film, after: Film, limit: np.float32) -> float:
 
 
 def _is_shared(sections: Means, valid: Mask, band: int, places: Frames, span: Frames) -> bool:
-    """Return whether another band deviates alike, a few frames earlier or later, and as suddenly.
-
-    Of the means of parts of the image (time, part); `places` are a frame and those that it deviates
-    from, `span` the first and last that do, of a step its frame and the one before.
-    """
+    """Return whether another band deviates alike, within a few frames, and as suddenly."""
+    # Places: a frame, and those that it deviates from. Span: first and last deviant frame, or of a
+    # step its frame and the frame before.
     if not _is_sudden(sections[band], places, span, _COMES):
         return True  # the object, or people, who come and go
     deviation = sections[band][places[0]] - sections[band][places[1:]].mean(axis=0)
@@ -327,18 +321,17 @@ def _scores(detail: Film, valid: Mask, renewals: Mask) -> Array:
 
 
 def _change(detail: Film, valid: Mask, frame: int) -> tuple[Film, Array, float]:
-    """Change of the detail (pixel) at a frame, from mean to mean of the frames on both sides.
-
-    And the shares of it that each frame (time) brings, and that stays, where it changes most.
-    """
+    """Change of the detail (pixel) at a frame; shares of it by frame (time), and that stay."""
     before, after = np.flatnonzero(valid[:frame])[::-1], frame + np.flatnonzero(valid[frame:])
     if min(before.size, after.size) == 0:
         return np.zeros(detail.shape[1], dtype=np.float32), np.zeros(len(detail)), 0.0
+    # Means of the frames on both sides, near and far.
     near, far = (
         detail[after[section] if after[section].size else after].mean(axis=0)
         - detail[before[section] if before[section].size else before].mean(axis=0)
         for section in (slice(_WINDOW), slice(_WINDOW, 2 * _WINDOW))
     )
+    # Shares where the detail changes most.
     strong = np.abs(near) > np.median(np.abs(near))
     frames = np.sort(np.concatenate([before[:_WINDOW], after[:_WINDOW]]))
     shares = np.zeros(len(detail))
