@@ -293,7 +293,7 @@ def frozen(repeats: Mask, chance: float) -> Mask:
 def copies(repeats: Mask, chance: float, valid: Mask) -> Mask:
     """Frames (time) in which all changing pixels repeat, and more of them than noise makes."""
     least = _needed(len(valid), chance)
-    # Bytes add up faster than truth values; nearly always there are fewer.
+    # Bytes add up faster than truth values; nearly always the repeats are too few.
     if not np.any(repeats.view(np.uint8).sum(axis=1, dtype=np.uint32) >= least):
         return np.zeros(len(valid), dtype=bool)
     moving = ~repeats.all(axis=0)
@@ -331,7 +331,7 @@ def _gaussian(images: npt.NDArray[np.floating], width: float) -> Array:
     sums = gaussian_filter(sums, width / step, mode="constant", axes=(-2, -1))
     if step == 1:
         return np.asarray(sums)
-    # Between the middles of these.
+    # Interpolate between the middles of the blocks of pixels.
     place = (np.indices(images.shape[-2:]) - 0.5 * (step - 1)) / step
     flat = sums.reshape(-1, *sums.shape[-2:])
     fine = [map_coordinates(image, place, order=1, mode="nearest") for image in flat]

@@ -31,7 +31,7 @@ class Subspace:
     """Functions of time that are projected out of a signal, nested by order."""
 
     functions: Array  # (time, steps + order), orthonormal: constant, steps, rising polynomials
-    object_part: Array  # the same columns less the steps of the camera in them
+    object_part: Array  # `functions` less the steps of the camera in them
     steps: int  # columns of every order, beside the constant
     rising: Array  # polynomials (time, degree) from 1 up, less the steps of the camera
     pieces: npt.NDArray[np.intp] | None = None  # frames with a column, if not all (column, 2)

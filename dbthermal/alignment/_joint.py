@@ -40,7 +40,7 @@ class Comparison:
     """Offset of each band's clock against the first, and how it was found."""
 
     offset: xr.DataArray  # (band) [s]
-    std: float  # standard deviation of the largest uncertainty of them [s]
+    std: float  # standard deviation of the least certain offset [s]
     field: xr.Dataset | None = None  # shift of the reflections; None where they are not apart
     doubts: tuple[str, ...] = ()
 
@@ -270,7 +270,7 @@ def _of_squares(corrected: xr.Dataset) -> xr.Dataset:
         valid = schema.measured(values) & ~bad[window]
         means = np.where(valid, values, 0.0).sum(axis=1, dtype=np.float64)
         means = quotient(means, valid.sum(axis=1), np.nan)
-        measured = np.isfinite(means).all(axis=0)  # of all bands the same pixels
+        measured = np.isfinite(means).all(axis=0)  # the same pixels in all bands
         valid &= measured
         change = np.where(valid, values - means[:, np.newaxis], 0.0)
         squares = (bands, -1, side, width, side)
@@ -302,7 +302,7 @@ def _of_means(aligned: xr.Dataset, scale: Scale) -> tuple[xr.Dataset, Scale]:
     rows = []
     for top in range(counts.sizes["y"]):
         block = counts[:, :, top : top + 1].astype(np.float64)
-        # Of all bands the same samples, on one side of a shutter event.
+        # The same samples in all bands, on one side of a shutter event.
         valid = schema.measured(block).all("band") & (segment == first)
         rows.append(block.where(valid).coarsen(time=length, boundary="trim").mean())
     mean = xr.Dataset(

@@ -35,7 +35,7 @@ _USUAL: Final = 0.95  # share of a pixel's samples that are no rare change
 _ROUGH: Final = 0.5  # assumed deviation of a whole-pixel match [pixel]
 # Parts along a side of the image, for a delay's jackknife; pixels that give a movie's noise.
 _PARTS, _NOISE_PIXELS = 6, 256
-_RIDGE: Final = 1e-4  # of the largest information on a shift, where there is none
+_RIDGE: Final = 1e-4  # of the largest information on a shift, added for windows without any
 
 
 @dataclass(frozen=True)
@@ -185,7 +185,7 @@ def start(movies: Movies, films: list[Movie], freedom: float, spline: Spline) ->
     reach = movies.valid.shape[0] // 3, movies.valid.shape[1] // 3
     pictures = []
     for film, level in zip(films, movies.noise, strict=True):
-        # Changes as large as there are seldom are cut: an object's, if rapid.
+        # Rare large changes are cut: they are an object's, if it changes rapidly.
         picture = images.blurred(film, BLUR)
         usual = np.quantile(np.abs(picture), _USUAL, axis=-1, keepdims=True)
         picture /= np.sqrt(1.0 + (picture / np.maximum(usual, 1e-12)) ** 2) * level * _VALUE_NOISE

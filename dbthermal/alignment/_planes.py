@@ -36,12 +36,12 @@ _PLANES, _FOR_EACH = 96, 8
 # Of displaced windows: frames, number along either side of the image, and their sides [pixel].
 _FRAMES, _ALONG, _SIDES = 400, 8, (8, 16)
 _BLUR: Final = 2.0  # before a displacement is looked for [pixel]
-# Chance below and pixels or frames from which it is a displacement, of so many windows at least.
+# Chance below which, and pixels or frames from which, so many windows or more are displaced.
 _CHANCE, _LEAST, _LEAST_LATE, _FEWEST = 1e-3, 0.3, 0.1, 4
 _STRONG: Final = 3.0  # variance of a window's changes over the noise
 # Functions of time, of a smooth object at most, and of what changes rapidly; pixels that tell them.
 _ORDER, _RAPID_PLANES, _RAPID_PIXELS = 14, 32, 100
-_COMMON_SAMPLES: Final = 0.9  # samples of a pixel over those of others
+_COMMON_SAMPLES: Final = 0.9  # least share of a pixel's samples, over the largest such share
 
 
 @dataclass(frozen=True)
@@ -228,7 +228,7 @@ def share_displaced(corrected: xr.Dataset, scale: Scale) -> float:
 def _share(windows: Array) -> float:
     """Share of windows whose bands are apart, from normal equations A d = g (window, 4, 3)."""
     number, whole, size = len(windows), windows.sum(axis=0), windows.shape[2]
-    # All windows, and those without one after another, have to tell a displacement.
+    # All windows, and all but each window in turn, must determine a displacement.
     sums = np.concatenate([whole[np.newaxis], whole - windows])
     if number < _FEWEST or np.linalg.eigvalsh(sums[:, :size]).min() <= 0.0:
         return 0.0

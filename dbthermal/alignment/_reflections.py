@@ -29,7 +29,7 @@ _SLOW: Final = 20.0  # shortest period of which a delay is estimated [frame]
 _MORE, _AGREE = 1.25, 4.5
 _KNOWN: Final = 0.2  # largest deviation of a shift by the data of a window alone [pixel]
 _WIDE: Final = 6.0  # deviation of the window in which a field and its data are compared [pixel]
-_RIDGE: Final = 1e-6  # of the largest information, where there is none
+_RIDGE: Final = 1e-6  # of the largest information, added for windows without any
 # Shift from which the cameras see reflections apart: in standard deviations, and in pixels.
 _SIGMAS, _LEAST_SHIFT = 3.0, 0.1
 # Share of what no shift leaves that a shift must explain: seen 0.36 or more; below 0.03 of clouds
@@ -89,7 +89,7 @@ def _matched(corrected: xr.Dataset, capture: Capture) -> xr.Dataset:
     spline = Spline((shape[0], shape[1]), max(shape) / 3.0)
     factor = 2 ** max(0, int(np.log2(min(shape) / _COARSE)))
     capture, tried, period, field = _coarse(capture, spline, factor)
-    # Planes in one look at the films. In slower changes there is more of a delay than noise.
+    # Planes of both periods in one reading of the films: slower changes show more of a delay.
     slow = min((longer for longer in tried if longer >= max(period, _SLOW)), default=max(tried))
     functions = [tried[length] for length in sorted({period, slow})]
     movies, white = capture.planes(functions), planes.white(capture.frames.size, period)
@@ -215,7 +215,7 @@ def _result(
     measured = _resolved(data) & reached
     distance = np.asarray(distance_transform_edt(~measured))
     near = (distance <= _NEAR * min(shape)) & reached & measured.any()
-    # Away from where it is known the field may change as much as it does there.
+    # Away from known pixels the field may change as much as it does in known pixels.
     slopes = np.square(np.gradient(shift, axis=(1, 2))).sum(axis=0)[:, measured]
     growth = np.multiply.outer(slopes.sum(axis=1) / max(1, measured.sum()), distance**2)
     std = np.sqrt(np.maximum(variance, 0.0) + growth)

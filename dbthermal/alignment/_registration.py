@@ -272,7 +272,7 @@ def _start(pair: list[Array], band: str) -> tuple[float, Array]:
         blurred = [gaussian_filter(image, blur) for image in pair]
         films = [image[np.newaxis] for image in blurred]
         matrix = _fitted(films, matrix, _FREE["translation"], blur, band)
-    # What both show at the same place must be alike.
+    # The images must be alike where they overlap.
     places = positions(matrix, pair[0].shape)
     overlap = _overlap(places, band)
     values = sampled(spline_filter(blurred[1])[..., np.newaxis], places[:, overlap])[0]

@@ -213,7 +213,7 @@ def on_one_clock(
     times, segment = clocks.fill_times(stamps[reference]), schema.segments(corrected)
     # Plan the interpolation of each band, and how it reduces noise.
     plans, factors, thin = [], np.ones(len(names)), -(-signals[0].size // lags.TELLING)
-    # Frames that are NaN, or a copy of the one before, in every block of rows.
+    # Frames that are NaN, or a copy of the frame before, in every block of rows.
     blocks = (counts.isel(y=rows).values for rows in _rows.blocks(counts.shape))
     copies = [[clocks.missing(single(film)) for film in block] for block in blocks]
     missing = np.all(copies, axis=0)

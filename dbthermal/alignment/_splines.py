@@ -292,7 +292,7 @@ class Field:
     factor: Array  # of the information, by Cholesky
     penalty: float
     sharpness: Array  # weight of each bending (2, bending) [1]
-    settled: bool  # the penalty is the best of those near it
+    settled: bool  # the penalty is better than the penalties near it
 
     def on(self, centres: list[Array]) -> Array:
         """Displacement (2, y, x) [pixel] at rows and columns."""

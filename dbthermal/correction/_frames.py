@@ -26,8 +26,8 @@ Means = list[Array]  # over parts of the image (time, part), of each band
 _PIXELS, _ROWS_AT_LEAST = 16384, 24  # of a band that are looked at, about
 _SAMPLES: Final = 2**24  # of a band, at most: of a long capture fewer pixels
 _PASSES: Final = 4  # bad frames beside bad frames, as of a shutter that moves, are found in turn
-# Share of the pixels that change where a run of bad frames begins and ends; of those that deviate
-# in it; of a torn row; and of the rows that are torn.
+# Least share of pixels that change where a run of bad frames begins and ends; that deviate in the
+# run; that deviate in a torn row; and of torn rows.
 _EDGE, _MOST, _ROW, _ROWS = 0.08, 0.5, 0.9, 0.1
 _RETURN: Final = 0.5  # largest change across a run of bad frames, relative to its deviation
 _LONGEST, _AT_END = 5.0, 5  # longest run of bad frames [s], at an end of the capture [frame]
@@ -36,15 +36,15 @@ _BLOCKS: Final = (6, 8)  # parts of an image whose means are compared
 _COMES: Final = 0.4  # least share of a deviation that comes with one frame, and goes with one
 _LAGS: Final = 5  # by which the cameras may be apart [frame]
 _SHARED: Final = 0.7  # least correlation of a deviation that two bands see
-# Largest contrast of a shutter, relative to that which the scene has less of in few frames.
+# Largest contrast of a shutter over the scene's; share of frames with less than the scene's.
 _UNIFORM, _FEW = 0.3, 0.1
 _RANDOM: Final = 20.0  # differences of neighbouring pixels, relative to usual ones, of a random one
 _GAIN: Final = float(np.log(1.25))  # least change of a gain that is switched
 _ALIKE: Final = 0.9  # and least correlation of the images before and after
-_NEAR: Final = 10  # frames before and after it whose noise is compared
+_NEAR: Final = 10  # frames before and after a switched gain whose noise is compared
 _WINDOW: Final = 25  # frames before and after a step of the pattern
-_FEWEST: Final = 256  # pixels from which its variance is known within a sixth
-# Variance of a step of the pattern over that of noise, from which it is one.
+_FEWEST: Final = 256  # pixels from which a step's variance is known within a sixth
+# Least variance of a step of the pattern, over that of noise.
 _STEP: Final = 2.5
 # Least share of a step that a single frame brings; this and variance in another band, and mean
 # product of the signs, from which the scene has stepped.
@@ -156,7 +156,7 @@ def _leave_out(
                 valid[band, frames[start:stop]] = False
                 if not uniform[trio[0]]:
                     continue
-                # A shutter moves in the frames beside, in which a part of the image changes.
+                # In the frames before and after, a shutter moves: a part of the image changes.
                 for side, far in ((start - 1, start - 2), (stop, stop + 1)):
                     if 0 <= far < frames.size:
                         change = _changed(film[frames[far]], film[frames[side]], limit)
@@ -249,7 +249,7 @@ def _is_sudden(section: Array, places: Frames, span: Frames, share: float) -> bo
         return bool(np.delete(near, min(first - 1, 1)).max(initial=0.0) < _RETURN * energy)
     sides, across = section[places[1:]], section[places[2]] - section[places[1]]
     comes, goes = section[first] - sides[0], section[last] - sides[1]
-    # At an end of the capture, with both sides on one: no drift.
+    # At an end of the capture both frames lie on one side, where a drift deviates as well.
     ends = (places[1] > places[0]) == (places[2] > places[0])
     drifts = ends and abs(across @ deviation) > _RETURN * energy
     return bool(min(comes @ deviation, goes @ deviation) > share * energy and not drifts)

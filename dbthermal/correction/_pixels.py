@@ -102,7 +102,7 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     patterns, stds = list[float](), np.zeros(counts.sizes["band"])
     if "pattern_std" in corrected:
         stds = np.nan_to_num(corrected["pattern_std"].values)
-    # Frames within which a neighbour may change as well: those of 0.2 s, or five if more.
+    # Frames within which a neighbour may change as well: 0.2 s or five frames, the longer.
     time, reach = counts["time"].values.astype(np.float64), _REACH_FRAMES
     if time.size >= MINIMUM_FRAMES:
         reach = max(reach, int(np.ceil(_REACH_SECONDS / float(np.median(np.diff(time))))))

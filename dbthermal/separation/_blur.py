@@ -25,7 +25,7 @@ from dbthermal.separation import _misfit as misfits
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._misfit import Misfit, Reading
 
-_ROUNDS, _STEP, _SETTLED = 8, 4.0, 0.05  # turns, largest step [pixel^2], and share of the last one
+_ROUNDS, _STEP, _SETTLED = 8, 4.0, 0.05  # turns, largest step [pixel^2], last step over the sum
 _AROUND: Final = 13  # pixels along a side of a neighbourhood with one error of the ratio
 # Side [pixel] of what is one material, its largest ratio over the smallest, and the share of the
 # pixels that must be so.

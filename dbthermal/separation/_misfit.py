@@ -51,7 +51,7 @@ class Reading(NamedTuple):
 
     rows: slice
     signals: Array  # (band, frame, pixel) [K]
-    reflections: Array  # the same less the object's signal, of pixels without a flag
+    reflections: Array  # signals less the object's signal, in pixels without a flag
     frames: Mask  # that are read (time)
     pixels: Mask  # without a flag (pixel)
     gain: Array  # noise over that of a sample (band, pixel) [1]
@@ -87,7 +87,7 @@ class _Blocks(NamedTuple):
     pixels: Array  # their number
     noise: Array  # variances of remainder and reflection, and their covariance (3, ...) [K^2]
     rough: Array  # variance of the remainder's means in time, and its part of noise (2, ...) [K^2]
-    single: Array  # the same of single pixels, by differences of neighbours (2, ...) [K^2]
+    single: Array  # such variances of single pixels, by differences of neighbours (2, ...) [K^2]
     products: Array  # remainder times reflection, and reflection squared (2, event, ...) [K^2]
     freedom: Array  # degrees of freedom of each event (event, ...)
 

@@ -150,7 +150,7 @@ def _rapid(corrected: xr.Dataset, inputs: Inputs) -> Array:
             for place, ratio in enumerate(ratios, 1)
         ]
         form, force = (np.sum([pair[it] for pair in pairs], axis=0) for it in (0, 1))
-        # Is there any? A growth is no evidence: heat that spreads feigns one, with up to 76.
+        # Is there motion? A growth is no evidence: spreading heat feigns growth, with up to 76.
         before = np.swapaxes(path, 0, 1).reshape(len(basis), -1)
         steps, variance = jackknife(form, force, precision, before)
         score = np.median(quotient(steps**2, variance, 0.0), axis=0).reshape(len(bands), -1)
@@ -160,7 +160,7 @@ def _rapid(corrected: xr.Dataset, inputs: Inputs) -> Array:
         path += np.clip(steps, -_STEP, _STEP)
         if np.sqrt(np.mean(steps**2)) < _SETTLED:
             break
-    # The motion of lost frames lies between those before and after.
+    # The motion of lost frames is interpolated between the frames before and after.
     every, places = np.arange(frames.size), np.flatnonzero(frames)
     motion[bands] = np.apply_along_axis(lambda course: np.interp(every, places, course), 1, path)
     return motion

@@ -54,9 +54,9 @@ _NOT_COMPLETED: Final = (
     f"completed, the bands must have names of {[*FILTERS]} when the capture is made, or a prior on "
     "their emissivities."
 )
-_MANY: Final = 0.3  # share of them from which a shift does not explain it
-# Share of them from which the clocks are compared: of scenes with one clock at most 0.003, beside
-# reflections at several depths; and what one clock must leave of it.
+_MANY: Final = 0.3  # share of asynchronous pixels from which a shift does not explain them
+# Share of asynchronous pixels from which the clocks are compared: of scenes with one clock at most
+# 0.003, beside reflections at several depths; and the part of it that one clock may leave.
 _SOME, _LESS = 0.05, 0.5
 
 
@@ -258,7 +258,7 @@ def _mended(
     retry = None if alike is None else once(alike.capture, measured.reflection_shift)
     if alike and retry and retry[0].sound > _KEPT * measured.sound:
         measured, less = retry
-        # Noise that is not white is told before: a blur takes rapid noise alone.
+        # Noise that is not white is estimated before the blur, which lessens rapid noise alone.
         detail = np.hypot(remainder, alike.detail)
         less = replace(less, change=np.hypot(less.change, detail), single=misfit.single)
         capture, outcome = alike.capture, (measured, less)

@@ -209,7 +209,7 @@ def separated(
             separate = partial(_separate, inputs, material, into, survey, wanted)
             for pixels in threads.map(separate, inputs.blocks):
                 bar.update(pixels)
-            # Few pixels in pieces may be so by a flaw, as a delay: these are searched anew.
+            # Few pixels in pieces may be caused by a flaw, as a delay: they are searched anew.
             if np.mean(inputs.division.any(axis=0)) < _DIVIDED:
                 inputs.division[:] = 0
             return survey
@@ -312,7 +312,7 @@ def _separate(
                 estimate = estimate.select_pixels(pixels)
             estimates.append((frames, pixels, estimate))
             if estimate.survey is not None:
-                # Whitened by one noise for all, not by that of the pixel.
+                # Whitened by the noise common to all pixels, not by the noise of this pixel.
                 scale = tile.scaled(tile.noise) / inputs.noise[inputs.bands][:, np.newaxis]
                 scatter = estimate.survey.scatter * (scale[:, np.newaxis] * scale)
                 section = replace(estimate.survey, scatter=scatter)
