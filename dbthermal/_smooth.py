@@ -77,11 +77,8 @@ def leading(samples: npt.NDArray[Any], count: int) -> npt.NDArray[Any]:
 def subspace(
     time: npt.ArrayLike, order: int, *, segment: npt.NDArray[np.integer] | None = None
 ) -> Subspace:
-    """Smooth functions of an order over times (time,) [s], with a step for each shutter event.
-
-    A signal's step where `segment` (time) changes, the number of shutter events before each frame,
-    is the camera's. ValueError as `polynomial_basis`, or if there are more functions than times.
-    """
+    """Smooth functions of an order over times (time,) [s], with a step for each shutter event."""
+    # A step where `segment` (time) changes, the number of shutter events before, is the camera's.
     plain, steps = np.asfortranarray(polynomial_basis(time, order)), camera_steps(segment)
     if not steps:
         return Subspace(plain, plain, 0, plain[:, 1:])
@@ -112,15 +109,12 @@ def piecewise(
     segment: npt.NDArray[np.integer] | None = None,
     number: int = PIECE_ORDER,
 ) -> Subspace:
-    """Polynomials in pieces of the time, each from one of the `first` frames (time,), of one order.
-
-    A piece has `number` polynomials, or as many as frames; `rising` (time, degree) is that of
-    `subspace`. No piece may begin with a shutter event: its step would be the object's as well.
-    """
+    """Polynomials, `number` at most, in each piece of the time between `first` frames (time,)."""
     time = np.asarray(time, dtype=np.float64)
     if segment is not None and segment[0] == segment[-1]:  # it only rises
         segment = None
     edges = np.append(np.flatnonzero(first), time.size)
+    # No piece may begin with a shutter event: its step would be the object's as well.
     events = np.zeros(edges.size - 1, dtype=np.intp)
     if segment is not None:
         rises = (np.diff(segment, prepend=segment[0]) > 0) & ~first
