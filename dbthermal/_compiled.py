@@ -54,10 +54,7 @@ def kept(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
 compiled: Final = kept(
     nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz", "arcp"}
 )
-"""Decorator of loops that as passes over arrays would take several times as long.
-
-Sums may be taken in any order; NaN stays NaN.
-"""
+"""Decorator of loops that take longer as passes over arrays; sums in any order, NaN stays NaN."""
 
 
 class _Cache(FunctionCache):

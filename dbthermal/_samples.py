@@ -54,11 +54,7 @@ _END: Final = 2.0  # width [noise] of the end of a pixel's values
 
 
 def noise(signal: npt.NDArray[Any]) -> Array:
-    """Noise (pixel ...) of signals (time, pixel ...) with NaN; NaN for too few frames.
-
-    The mean magnitude of the smaller four fifths of the second differences, without object and
-    passing reflections.
-    """
+    """Noise (pixel ...) of signals (time, pixel ...) with NaN; NaN for too few frames."""
     valid = np.isfinite(signal)
     frames = valid.sum(axis=0)
     if not valid.all():  # invalid samples of each pixel go behind the valid ones
@@ -66,6 +62,7 @@ def noise(signal: npt.NDArray[Any]) -> Array:
         signal = np.take_along_axis(signal, order, axis=0)
     second = np.abs(signal[1:-1] - 0.5 * (signal[:-2] + signal[2:]))
     second.sort(axis=0)  # NaN last
+    # The smaller four fifths of the changes are free of the object and of passing reflections.
     quiet = np.maximum((_QUIET * (frames - 2)).astype(np.intp), 1)
     used = np.arange(len(second)).reshape(-1, *(1,) * quiet.ndim) < quiet
     total = second.sum(axis=0, dtype=np.float64, where=used)
@@ -75,12 +72,6 @@ def noise(signal: npt.NDArray[Any]) -> Array:
 
 def larger_noise(signals: npt.NDArray[Any], stated: Array) -> Array:
     r"""Noise (band) where signals (band, time, pixel) prove more than stated (band), else NaN [K].
-
-    Second differences of groups of three frames are noise in the stillest tenth of the groups,
-    which are selected by the second differences of their neighbours in all bands, and by the third
-    difference of their means, which a step raises; so selected, noise keeps its distribution. The
-    smaller seven tenths of the magnitudes give the noise s. It is not proved if the next quarter,
-    where rare motion shows first, or the slopes of neighbouring groups give a larger one.
 
     Jumps at every frame are white, but occur in all bands. If the excess over the stated noise were
     motion, at most K times weaker in another band n, then
@@ -102,7 +93,8 @@ def larger_noise(signals: npt.NDArray[Any], stated: Array) -> Array:
         stop = min(start + step, groups - 4)
         statistics[:, :, start:stop] = _differences(three[:, start : stop + 4])
     rapid, change, surroundings = statistics.reshape(3, bands, -1)
-    # Select the stillest tenth of the groups.
+    # Select the stillest tenth of the groups by the differences around each group, in all bands:
+    # noise within the group keeps its distribution.
     valid = np.all(np.isfinite(rapid) & (surroundings > 0), axis=0)  # NaN is not
     number = int(_STILLEST * np.count_nonzero(valid))
     if number < _FEWEST_STILL:
@@ -110,7 +102,8 @@ def larger_noise(signals: npt.NDArray[Any], stated: Array) -> Array:
     motion = surroundings / np.median(surroundings[:, valid], axis=1, keepdims=True)
     stillest = np.argpartition(np.where(valid, motion.sum(axis=0), np.inf), number)[:number]
     still, middle, last = rapid[:, stillest], *(_RANKS[1:] * number).astype(np.intp)
-    # Noise from the smaller magnitudes, checked by larger ones and by slopes.
+    # Noise from the smaller seven tenths of the magnitudes. It is not proved if it is larger in the
+    # next quarter, where rare motion shows first, or in the slopes of neighbouring groups.
     ordered = np.sort(np.abs(still), axis=1)
     noise = ordered[:, :middle].mean(axis=1) / _MEANS[0]
     beyond = ordered[:, middle:last].mean(axis=1) / _MEANS[1]
@@ -132,7 +125,8 @@ def _differences(three: npt.NDArray[Any]) -> tuple[Array, Array, Array]:
     slope = (three[:, :, 2] - three[:, :, 0]) / np.sqrt(2.0)
     change = (slope[:, 2:-2] - 0.5 * (slope[:, 1:-3] + slope[:, 3:-1])) / np.sqrt(1.5)
     third = means[:, 4:] - means[:, :-4] - 2.0 * (means[:, 3:-1] - means[:, 1:-3])
-    # A mean of three has a third of the noise's variance, their third difference 10 times that.
+    # A step raises the third difference of the means. A mean of three has a third of the noise's
+    # variance, their third difference 10 times that.
     surroundings = 0.3 * third**2
     for first in (0, 1, 3, 4):
         surroundings += rapid[:, first : first + inner] ** 2
@@ -299,7 +293,7 @@ def frozen(repeats: Mask, chance: float) -> Mask:
 def copies(repeats: Mask, chance: float, valid: Mask) -> Mask:
     """Frames (time) in which all changing pixels repeat, and more of them than noise makes."""
     least = _needed(len(valid), chance)
-    # Bytes add up faster than truth values; nearly always there are fewer.
+    # Bytes add up faster than truth values; nearly always the repeats are too few.
     if not np.any(repeats.view(np.uint8).sum(axis=1, dtype=np.uint32) >= least):
         return np.zeros(len(valid), dtype=bool)
     moving = ~repeats.all(axis=0)
@@ -337,7 +331,7 @@ def _gaussian(images: npt.NDArray[np.floating], width: float) -> Array:
     sums = gaussian_filter(sums, width / step, mode="constant", axes=(-2, -1))
     if step == 1:
         return np.asarray(sums)
-    # Between the middles of these.
+    # Interpolate between the middles of the blocks of pixels.
     place = (np.indices(images.shape[-2:]) - 0.5 * (step - 1)) / step
     flat = sums.reshape(-1, *sums.shape[-2:])
     fine = [map_coordinates(image, place, order=1, mode="nearest") for image in flat]

@@ -31,7 +31,7 @@ class Subspace:
     """Functions of time that are projected out of a signal, nested by order."""
 
     functions: Array  # (time, steps + order), orthonormal: constant, steps, rising polynomials
-    object_part: Array  # the same columns less the steps of the camera in them
+    object_part: Array  # `functions` less the steps of the camera in them
     steps: int  # columns of every order, beside the constant
     rising: Array  # polynomials (time, degree) from 1 up, less the steps of the camera
     pieces: npt.NDArray[np.intp] | None = None  # frames with a column, if not all (column, 2)
@@ -77,12 +77,8 @@ def leading(samples: npt.NDArray[Any], count: int) -> npt.NDArray[Any]:
 def subspace(
     time: npt.ArrayLike, order: int, *, segment: npt.NDArray[np.integer] | None = None
 ) -> Subspace:
-    """Smooth functions of an order over given times (time,) [s], with steps of the camera.
-
-    At each change of the `segment` (time), the number of shutter events before each frame, every
-    signal has a step of its own, which is not the object's. ValueError as `polynomial_basis`, or if
-    there are more functions than times.
-    """
+    """Smooth functions of an order over times (time,) [s], with a step for each shutter event."""
+    # A step where `segment` (time) changes, the number of shutter events before, is the camera's.
     plain, steps = np.asfortranarray(polynomial_basis(time, order)), camera_steps(segment)
     if not steps:
         return Subspace(plain, plain, 0, plain[:, 1:])
@@ -113,16 +109,12 @@ def piecewise(
     segment: npt.NDArray[np.integer] | None = None,
     number: int = PIECE_ORDER,
 ) -> Subspace:
-    """Polynomials in pieces of the time that begin with some frames (time,), of one order together.
-
-    So many in each piece, or as many as it has frames. The rising polynomials (time, degree) are
-    those of `subspace`. A shutter event must not be the first frame of a piece: its step would
-    be the object's as well. The leverage is that of more functions, for pieces that were chosen.
-    """
+    """Polynomials, `number` at most, in each piece of the time between `first` frames (time,)."""
     time = np.asarray(time, dtype=np.float64)
     if segment is not None and segment[0] == segment[-1]:  # it only rises
         segment = None
     edges = np.append(np.flatnonzero(first), time.size)
+    # No piece may begin with a shutter event: its step would be the object's as well.
     events = np.zeros(edges.size - 1, dtype=np.intp)
     if segment is not None:
         rises = (np.diff(segment, prepend=segment[0]) > 0) & ~first
@@ -188,16 +180,13 @@ def _polynomials(
     chosen: Array,
     leverage: Array,
 ) -> None:
-    """As `_arnoldi`, so many in each piece between edges, one column (column, time) after another.
-
-    In place, where the columns are zero: these, their spans, the leverage (time, 1), and what it is
-    over that of pieces whose ends are not chosen from the data.
-    """
+    """Fill columns (column, time) of zeros with the polynomials of pieces, and their leverage."""
     column = 0
     for piece in range(counts.size):
         start, stop, count = edges[piece], edges[piece + 1], counts[piece]
         middle = 0.5 * (time[start] + time[stop - 1])
         ends = (1.0 if piece > 0 else 0.0) + (1.0 if piece < counts.size - 1 else 0.0)
+        # An end of a piece that was chosen from the data raises the leverage, see `CHANGE_POINT`.
         factor = 1.0 + 0.5 * CHANGE_POINT * ends / count
         chosen[start:stop] = factor
         at, over = time[start:stop], leverage[start:stop, 0]
@@ -242,13 +231,11 @@ def polynomial_basis(time: npt.ArrayLike, order: int) -> Array:
 
 
 def _arnoldi(position: Array, order: int) -> Array:
-    """As `polynomial_basis`, where frames in few places make polynomials nearly dependent.
-
-    Each function is the one before times the position, made orthogonal (Brubeck, Nakatsukasa,
-    Trefethen 2021, doi:10.1137/19M130839X).
-    """
+    """Columns of `polynomial_basis`, where frames in few places make them nearly dependent."""
     columns = np.full((position.size, order), 1.0 / np.sqrt(position.size))
     for degree in range(1, order):
+        # The previous function times the position, made orthogonal (Brubeck, Nakatsukasa,
+        # Trefethen 2021, doi:10.1137/19M130839X).
         following = position * columns[:, degree - 1]
         for _ in range(2):  # once more, against rounding
             previous = columns[:, :degree]
@@ -258,13 +245,11 @@ def _arnoldi(position: Array, order: int) -> Array:
 
 
 def bridge(film: npt.NDArray[Any], pixels: Mask) -> npt.NDArray[Any]:
-    """Bridge samples of a film (time, pixel) without a number by lines, in place, at some pixels.
-
-    Before the first number and after the last these go on. Returns the film.
-    """
+    """Fill missing samples of some pixels of a film (time, pixel) by lines, in place; return it."""
     last = np.full(pixels.size, -1)
     for frames in parts(film):
         _bridge(film, frames.start, min(frames.stop, len(film)), pixels, last)
+    # A curve ends as its last number.
     for pixel in np.flatnonzero(pixels & (last >= 0) & (last < len(film) - 1)):
         film[last[pixel] + 1 :, pixel] = film[last[pixel], pixel]
     return film
@@ -272,7 +257,7 @@ def bridge(film: npt.NDArray[Any], pixels: Mask) -> npt.NDArray[Any]:
 
 @compiled
 def _bridge(film: Any, start: int, stop: int, pixels: Mask, last: Any) -> None:
-    """Bridge the gaps of pixels that end in some frames, in place; the last frame with a number."""
+    """Fill the gaps that end in some frames, in place, and note the last frame with a number."""
     for frame in range(start, stop):
         for pixel in range(pixels.size):
             if not pixels[pixel] or not np.isfinite(film[frame, pixel]):

@@ -183,12 +183,11 @@ def numbers(rows: Sequence[Row], width: int, source: str) -> NDArray[np.float64]
 def read_yaml(path: str | Path) -> dict[Any, Any]:
     """Mapping in a YAML file, whose values mean the same in YAML 1.1 and 1.2.
 
-    Keys are text or numbers; values are mappings, lists, text, finite numbers, bool or None.
-
-    ValueError, one line with file, line, column and rule, for: text that is no YAML, or no mapping;
-    repeated keys (also ``1`` beside ``"1"``); anchors, aliases, tags, several documents, deep
-    nesting; numbers that are not finite; and plain values that the versions of YAML read
-    differently, such as ``on``, ``012``, ``12:30``, ``1e3`` or a date. In quotes they are text.
+    Keys are text or numbers; values are mappings, lists, text, finite numbers, bool or None. A
+    ValueError names file, line, column and rule for: text that is no YAML, or no mapping; repeated
+    keys (also ``1`` beside ``"1"``); anchors, aliases, tags, several documents, deep nesting;
+    numbers that are not finite; and plain values that the versions of YAML read differently, such
+    as ``on``, ``012``, ``12:30``, ``1e3`` or a date. In quotes they are text.
 
     Parameters
     ----------

@@ -27,8 +27,8 @@ class Interpolation:
 
     .. math:: I(t) = (1 - w) I_{before} + w I_{after} + \sum_{i=-1}^{2} b_i I_{before + i}
 
-    Half-way between frames the line keeps 71 % of a change of four frames from crest to crest, the
-    cubic 88. Without four frames in a row the bend b is 0.
+    Half-way between frames the line keeps 71 % of a wave with a period of four frames, the cubic
+    88 %. The bend b is the cubic's, times a share (`_offset.bent`); 0 without four frames in a row.
     """
 
     before: Whole  # frames (wanted)
@@ -37,16 +37,12 @@ class Interpolation:
     bend: Array  # b (wanted, 4) [1]
     valid: Mask  # false across a gap or past an end (wanted)
     stamps: Array  # exposure times (time) [s]
-    swing: float = 0.125  # of the largest step, by which a curve may leave the line beside a step
+    swing: float = 0.125  # share of the largest step by which a bend may deviate beside a step
 
     def apply(
         self, frames: npt.NDArray[Any], out: npt.NDArray[Any], largest_step: float = np.inf
     ) -> None:
-        """Write the interpolated frames (wanted, ...) into `out`, NaN where not valid.
-
-        NaN, too, where two samples differ by more than `largest_step`, and beside such a step,
-        where a curve swings.
-        """
+        """Write the interpolated frames (wanted, ...) into `out`, NaN where they are not valid."""
 
         @lru_cache(maxsize=3)  # of the frames' intervals in turn
         def steps(before: int, after: int) -> npt.NDArray[Any]:
@@ -61,6 +57,7 @@ class Interpolation:
                 out[place] = frames[after if weight else before]
             else:
                 out[place] = (1.0 - weight) * frames[before] + weight * frames[after]
+                # Unknown where a signal steps, and beside a step where the bend overshoots.
                 unknown = steps(before, after)
                 if self.bend[place].any():
                     four = frames[before - 1 : after + 2]
@@ -163,15 +160,13 @@ def frame_period(stamps: Array) -> float:
 
 
 def even_times(stamps: Array, reach: int) -> Array:
-    """Evenly spaced times [s] to which all cameras, with exposure times (band, time), are brought.
-
-    The exposure times themselves if all bands share even ones; else from the last camera's start to
-    the first one's end in steps of the longest frame period, within `reach` steps of a frame.
-    """
+    """Even times [s] in steps of the longest frame period, for exposure times (band, time)."""
     step = max(frame_period(row) for row in stamps)
     shared = bool(np.all(stamps == stamps[0]))
+    # Even times that all bands share are taken as they are.
     if shared and np.all(np.abs(np.diff(stamps[0]) - step) <= _EVEN * step):
         return np.asarray(stamps[0])
+    # From the latest start to the earliest end, within `reach` steps of a frame.
     start, stop = float(np.nanmin(stamps, axis=1).max()), float(np.nanmax(stamps, axis=1).min())
     if stop - start < step:
         label = f"Invalid exposure times: the bands overlap from {start} to {stop} s"
@@ -186,6 +181,7 @@ def require_steady(stamps: Array, bands: list[str]) -> None:
     for band, row in zip(bands, stamps, strict=True):
         times, period = row[np.isfinite(row)], frame_period(row)
         steps = np.diff(times)
+        # Share of steps near the period, and of frames in rows of at least `_ROW` without a pause.
         even = np.mean(np.abs(steps - period) <= 0.5 * period)
         rows = np.diff(np.flatnonzero(np.r_[True, steps > PAUSE * period, True]))
         share = rows[rows >= min(_ROW, times.size)].sum() / times.size
@@ -205,23 +201,20 @@ def pauses(times: Array) -> Array:
 
 
 def interpolation(stamps: Array, present: Mask, wanted: Array, segment: Whole) -> Interpolation:
-    """Interpolation of frames exposed at `stamps` (time) [s], at times `wanted` [s].
-
-    Valid where a frame was exposed within 1 % of a period, or one each before and after in one
-    `segment` (time), at most one and a half frame periods apart. The bend is the cubic's.
-    """
+    """Interpolation of frames exposed at `stamps` (time) [s], at `wanted` times [s], by cubics."""
     usable = np.flatnonzero(present & np.isfinite(stamps))
     if usable.size < _MINIMUM_FRAMES:
         rule = f"at least {_MINIMUM_FRAMES}: the others are NaN or copies of the frame before"
         raise ValueError(f"Invalid capture of {usable.size} valid frames. Must be {rule}.")
     times, step = stamps[usable], frame_period(np.where(present, stamps, np.nan))
-    # Frames before and after each wanted time, and weight of the latter.
+    # Frames before and after each wanted time, and weight of the frame after.
     right = np.clip(np.searchsorted(times, wanted), 1, usable.size - 1)
     width = times[right] - times[right - 1]
     weight = (wanted - times[right - 1]) / width
+    # A sample exposed within 1 % of a frame period is taken as it is.
     nearest = np.rint(weight)
     weight = np.where(np.abs(weight - nearest) * width <= _COINCIDENT * step, nearest, weight)
-    # Neighbours in time without a gap, within one segment.
+    # Interpolate between neighbours at most one and a half periods apart, within one segment.
     joined = (np.diff(times) <= _GAP * step) & (np.diff(segment[usable]) == 0)
     between = (weight > 0) & (weight < 1) & joined[right - 1]
     valid = (weight == 0) | (weight == 1) | between

@@ -24,7 +24,7 @@ from dbthermal.alignment._reflections import seen_apart, shift_of
 from dbthermal.alignment._resampling import STEP, on_one_clock
 from dbthermal.schema import Status
 
-_PIXELS, _FRAMES = 20_000, 400  # of means in which clocks and shift are estimated, at most
+_PIXELS, _FRAMES = 20_000, 400  # of the capture of means that gives clocks and shift, at most
 _COMMON: Final = 0.5  # share of a square's pixels that a frame must have
 _ROUNDS, _VAIN = 8, 2  # clocks that are tried, at most, and in a row without improvement
 _LATE: Final = 0.02  # difference below which clocks are the same [frame]
@@ -40,7 +40,7 @@ class Comparison:
     """Offset of each band's clock against the first, and how it was found."""
 
     offset: xr.DataArray  # (band) [s]
-    std: float  # standard deviation of the largest uncertainty of them [s]
+    std: float  # standard deviation of the least certain offset [s]
     field: xr.Dataset | None = None  # shift of the reflections; None where they are not apart
     doubts: tuple[str, ...] = ()
 
@@ -159,10 +159,7 @@ def _explains_more(rival: xr.Dataset, field: xr.Dataset) -> bool:
 def _clocked(
     small: xr.Dataset, scale: Scale, synchronous: xr.DataArray, resample: Callable[..., xr.Dataset]
 ) -> tuple[xr.DataArray, xr.Dataset | None, float, list[xr.Dataset]]:
-    """Offsets of the clocks, the shift of the reflections, and the clocks' uncertainty [s].
-
-    And the shifts at all offsets that were tried.
-    """
+    """Offsets of the clocks, shift of the reflections, uncertainty [s], shifts of all trials."""
     names, trials = small["band"].values, list[_Trial]()
 
     def compare_at(**clock: Any) -> tuple[xr.DataArray, xr.Dataset | None]:
@@ -183,7 +180,7 @@ def _clocked(
         if not synchronous_trials or (trial := _next(synchronous_trials, frame)) is None:
             raise
         offset, field = compare_at(offset=trial)
-    while trials and field is trials[-1].field:  # the last one told a delay
+    while trials and field is trials[-1].field:  # the last trial has a delay
         if (trial := _next(trials, frame)) is None:
             break
         offset, field = compare_at(offset=trial)
@@ -273,7 +270,7 @@ def _of_squares(corrected: xr.Dataset) -> xr.Dataset:
         valid = schema.measured(values) & ~bad[window]
         means = np.where(valid, values, 0.0).sum(axis=1, dtype=np.float64)
         means = quotient(means, valid.sum(axis=1), np.nan)
-        measured = np.isfinite(means).all(axis=0)  # of all bands the same pixels
+        measured = np.isfinite(means).all(axis=0)  # the same pixels in all bands
         valid &= measured
         change = np.where(valid, values - means[:, np.newaxis], 0.0)
         squares = (bands, -1, side, width, side)
@@ -305,7 +302,7 @@ def _of_means(aligned: xr.Dataset, scale: Scale) -> tuple[xr.Dataset, Scale]:
     rows = []
     for top in range(counts.sizes["y"]):
         block = counts[:, :, top : top + 1].astype(np.float64)
-        # Of all bands the same samples, on one side of a shutter event.
+        # The same samples in all bands, on one side of a shutter event.
         valid = schema.measured(block).all("band") & (segment == first)
         rows.append(block.where(valid).coarsen(time=length, boundary="trim").mean())
     mean = xr.Dataset(

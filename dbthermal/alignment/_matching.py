@@ -17,8 +17,8 @@ from dbthermal.alignment import _splines as images
 from dbthermal.alignment._splines import Field, Information, Movie, Spline
 from dbthermal.noise import MAD
 
-WINDOW: Final = 2.5  # deviation of what shares a ratio and a whole-pixel match [pixel]
-BLUR: Final = 1.2  # deviation of the blur of all movies before, that nothing aliases [pixel]
+WINDOW: Final = 2.5  # deviation of a window of one ratio and one whole-pixel match [pixel]
+BLUR: Final = 1.2  # deviation of the blur of all movies, against aliasing [pixel]
 
 # Pixels at the border that are left out: what the blur mirrors there does not move. Along the
 # baseline, simulated shifts there were 0.028 pixel off with none, 0.015 with 1, 0.018 with 2.
@@ -27,15 +27,15 @@ _MIRRORED: Final = 1.0
 _VALUE_NOISE: Final = 1.0 / (2.0 * np.sqrt(np.pi) * BLUR)
 _SLOPE_NOISE: Final = _VALUE_NOISE * np.sqrt(2.0 * (1.0 - np.exp(-0.25 / BLUR**2)))
 _PLANES: Final = 32  # functions of time by which whole pixels are matched
-_ROUNDS, _ROBUST = 12, 4  # of a field, and of the weights of whole-pixel matches
+_ROUNDS, _ROBUST = 12, 4  # rounds of a field, and of robust weights of whole-pixel matches
 _CONVERGED: Final = 2e-3  # mean change of the field at its end, of coarser pixels larger [pixel]
 # Explained energy, in variances of noise, that chance does not reach at one of many shifts.
 _SIGNIFICANT: Final = 40.0
 _USUAL: Final = 0.95  # share of a pixel's samples that are no rare change
-_ROUGH: Final = 0.5  # deviation as which a rough match counts [pixel]
-# Parts along a side of the image, each left out of a delay; pixels that tell a movie's noise.
+_ROUGH: Final = 0.5  # assumed deviation of a whole-pixel match [pixel]
+# Parts along a side of the image, for a delay's jackknife; pixels that give a movie's noise.
 _PARTS, _NOISE_PIXELS = 6, 256
-_RIDGE: Final = 1e-4  # of the largest information on a shift, where there is none
+_RIDGE: Final = 1e-4  # of the largest information on a shift, added for windows without any
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,8 @@ class Movies:
     valid: Mask  # pixels (y, x) with data in all
     noise: Array  # standard deviation of a sample before the blur, first and others [K]
     freedom: float  # degrees of freedom of a pixel's noise
-    outside: float  # those of whole frames over these [1]
-    factor: int  # pixels of the capture along a side of one of these
+    outside: float  # degrees of freedom of whole frames over these [1]
+    factor: int  # pixels of the capture along a side of a pixel here
 
     @classmethod
     def blurred(
@@ -79,13 +79,11 @@ class Movies:
         return [np.asarray(self.factor * (np.arange(n) + 0.5) - 0.5) for n in self.valid.shape]
 
     def pairs(self, shift: Array) -> tuple[Array, Mask]:
-        """Places (2, y, x) moved by a shift of the capture's pixels; pixels that pair with them.
-
-        None of both near the border of the image, where the blur mirrors: that does not move.
-        """
+        """Places (2, y, x) moved by a shift of the capture's pixels; pixels that pair with them."""
         pixels, shape = np.indices(self.valid.shape), np.reshape(self.valid.shape, (2, 1, 1))
         places = pixels + shift / self.factor
         grids = np.stack([pixels, places])
+        # Near the border the blur mirrors, and what is mirrored does not move.
         inner = (grids >= _MIRRORED) & (grids <= shape - 1 - _MIRRORED)
         return places, inside(places, self.valid) & self.valid & np.all(inner, axis=(0, 1))
 
@@ -93,13 +91,10 @@ class Movies:
 def _whole_pixels(
     first: Movie, movies: list[Movie], freedom: float, reach: tuple[int, int]
 ) -> tuple[Array, Array]:
-    """Shift (2, y, x) of whole pixels that explains most, and its weight (y, x), 0 of chance.
-
-    Movies are in deviations of noise. Explained is a part of the others' energy in a window; the
-    weight is the share that is.
-    """
+    """Whole-pixel shift (2, y, x) that explains most of the movies; weight (y, x), 0 by chance."""
     height, width = first.shape[:2]
     padded = np.pad(first, (*((by, by) for by in reach), (0, 0)))
+    # Energies in variances of noise: movies are in deviations of noise.
     energies = [np.einsum("yxt,yxt->yx", it, it) for it in (padded, *movies)]
     best, where = np.zeros((height, width)), np.zeros((2, height, width))
     for down in range(2 * reach[0] + 1):  # a row's pairs of pixels at once
@@ -116,6 +111,7 @@ def _whole_pixels(
         best[better], where[0][better], where[1][better] = highest[better], down, right[better]
     # Products of two blurred noises are alike over an area of 2 pi BLUR^2.
     chance = _SIGNIFICANT * 2.0 * np.pi * BLUR**2 / (4.0 * np.pi * WINDOW**2)
+    # Weight: share of the movies' energy in a window that is explained.
     share = best / np.maximum(gaussian_filter(sum(energies[1:]), WINDOW), 1e-9)
     return where - np.reshape(reach, (2, 1, 1)), np.where(best > chance, share, 0.0)
 
@@ -152,7 +148,7 @@ def _information(movies: Movies, shift: Array) -> Information:
         # Summed over pixels, the noise is that before the blur.
         variance = level**2 + (ratio * movies.noise[0]) ** 2
         residual = gaussian_filter(hh - 2.0 * ratio * mh + ratio**2 * mm, WINDOW)
-        # Of all freedom, of which that outside the planes holds noise.
+        # Over the freedom of whole frames: what lies outside the planes is noise.
         excess = residual / (variance * _VALUE_NOISE**2) - number
         misfit = np.maximum(1.0 + excess / (number * movies.outside), 1.0)
         weight = used * ratio / (misfit * variance)
@@ -189,7 +185,7 @@ def start(movies: Movies, films: list[Movie], freedom: float, spline: Spline) ->
     reach = movies.valid.shape[0] // 3, movies.valid.shape[1] // 3
     pictures = []
     for film, level in zip(films, movies.noise, strict=True):
-        # Changes as large as there are seldom are cut: an object's, if rapid.
+        # Rare large changes are cut: they are an object's, if it changes rapidly.
         picture = images.blurred(film, BLUR)
         usual = np.quantile(np.abs(picture), _USUAL, axis=-1, keepdims=True)
         picture /= np.sqrt(1.0 + (picture / np.maximum(usual, 1e-12)) ** 2) * level * _VALUE_NOISE
@@ -235,17 +231,16 @@ def refine(movies: Movies, field: Field) -> tuple[Field, Information]:
 def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Array]:
     r"""Time by which the others show what the first movie shows at a shift, and its deviation [s].
 
-    The shift is (2, y, x) [pixel], the rate a matrix that takes planes to their change [1/s]. What
-    moves one way only is shifted or late. One Newton step of both, the shift free in each window:
-    with the slopes g of the moved movie :math:`h`, its change :math:`\dot h`, the residual r of the
-    others over their ratio to it, and sums over time and a window,
+    The shift is (2, y, x) [pixel], the rate a matrix that takes planes to their change [1/s].
+    Motion in one direction looks like a shift or a delay: a Newton step solves for both, the shift
+    free in each window. With the slopes g of the moved movie :math:`h`, its change :math:`\dot h`,
+    the residual r of the others over their ratio to h, and sums over time and a window,
 
     .. math:: \delta = \sum (\dot h r - c^T A^{-1} \, g r) / \sum (\dot h^2 - c^T A^{-1} c),
               \quad A = g g^T, \; c = g \dot h
 
-    The deviation is the jackknife's over parts of the image: where several depths are mirrored, the
-    windows contradict one another by far more than noise. Third, the energy (2, y, x) of the others
-    that the moved movie explains, and all of it beside noise, in variances of noise.
+    Third, the energy (2, y, x) of the others that the moved movie explains, and all their energy
+    beside noise, in variances of noise.
     """
     places, used = movies.pairs(shift)
     sums = images.products(movies.first, movies.others, places, rate) * used[..., np.newaxis]
@@ -268,6 +263,7 @@ def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Arra
         totals += np.where(used, np.stack([late, seen, alike, second]), 0.0) / level**2
     gradient, information, *energy = totals
     starts = [np.arange(_PARTS) * size // _PARTS for size in movies.valid.shape]
+    # Jackknife over parts of the image: windows of several depths differ by far more than noise.
     of_parts = np.add.reduceat(np.add.reduceat(totals[:2], starts[0], axis=1), starts[1], axis=2)
     with np.errstate(divide="ignore", invalid="ignore"):  # one part may tell all: no deviation
         without = (gradient.sum() - of_parts[0]) / (information.sum() - of_parts[1])

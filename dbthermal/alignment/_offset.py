@@ -32,7 +32,7 @@ from dbthermal._arrays import Array, Mask, stride
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.noise import MAD
 
-_PIXELS, _SAMPLES = 16384, 2**25  # that are compared, of a capture and of a band, at most
+_PIXELS, _SAMPLES = 16384, 2**25  # compared pixels, and samples of a band, at most
 SEARCH: Final = 5  # largest lag that is searched by default, either way [frame]
 # Step of one clock against the other from which a lost frame or a set clock is suspected [frame].
 _CLOCK_STEP: Final = 0.5
@@ -42,8 +42,9 @@ _GROUPS: Final = 16  # groups of pixels of the jackknife
 _SIGNIFICANCE: Final = 6.0  # least covariance of the bands [standard deviation]
 _PRECISION: Final = 0.1  # largest standard deviation of an offset [frame]
 _ORDER: Final = 8  # smooth functions that are projected out
-TELLING: Final = 2**22  # samples of a band from which a bend is told, at most
-# Share of a bend, at most, deviation (half a frame late: 1.0 to 1.5 +- 0.12), and unlike rates [1].
+TELLING: Final = 2**22  # samples of a band from which the share of a bend is estimated, at most
+# Largest share of the cubic's bend, and its largest standard deviation (1.0 to 1.5 +- 0.12 half a
+# frame late); and the difference of frame rates below which neighbouring frames compare [1].
 _MOST_BENT, _VAGUE, _ALIKE = 2.0, 0.25, 0.01
 
 
@@ -127,11 +128,7 @@ def measured_offset(
 def require_one_clock(
     pair: xr.Dataset, signals: Array, stamps: Array, search: int = SEARCH
 ) -> None:
-    """Refuse exposure times (band, time) [s] of two bands if the clock of one of them was set.
-
-    At the longest step of the clocks against each other a clock was set if the signals (band, time,
-    pixel) keep their offset without the step, and frames were lost if they keep it with the step.
-    """
+    """Refuse exposure times (band, time) [s] of two bands if the clock of one of them was set."""
     rows = np.flatnonzero(np.all(np.isfinite(stamps), axis=0))
     steps = np.diff(stamps[:, rows], axis=1)
     slip = steps[1] - steps[0]
@@ -140,6 +137,8 @@ def require_one_clock(
     place = int(np.argmax(np.abs(slip)))
     excess = steps[:, place] - np.median(steps, axis=1)
     band, last = int(np.argmax(np.abs(excess))), int(rows[place])
+    # Offsets before the step, after it, and after it with the step undone. A clock was set if the
+    # last is nearer to the first, frames were lost if the second is.
     before, after, undone = (stamps.copy() for _ in range(3))
     before[band, last + 1 :] = after[band, : last + 1] = undone[band, : last + 1] = np.nan
     undone[band] -= excess[band]
@@ -207,18 +206,16 @@ def check(corrected: xr.Dataset, band: str | None, search: int) -> int:
 
 
 def sample(corrected: xr.Dataset) -> Array:
-    """Counts (band, time, pixel) of usable pixels on an even grid, NaN in missing frames.
-
-    A usable pixel is not flagged as dead, saturated or invalid, changes in every band, and is
-    finite in every recorded frame.
-    """
+    """Counts (band, time, pixel) of usable pixels on an even grid, NaN in missing frames."""
     pixels = corrected.sizes["y"] * corrected.sizes["x"]
+    # Fewer pixels of a long capture.
     fitting = int(np.ceil(np.sqrt(pixels * corrected.sizes["time"] / _SAMPLES)))
     step = max(stride((corrected.sizes["y"], corrected.sizes["x"]), _PIXELS), fitting)
     subsample = corrected.isel(y=slice(None, None, step), x=slice(None, None, step))
     counts = subsample["counts"].values.astype(np.float64)
     counts[~schema.measured(counts)] = np.nan
     counts = counts.reshape(*counts.shape[:2], -1)
+    # Usable: not dead, saturated or invalid; finite in recorded frames, changing in all bands.
     usable = (schema.pixel_status(subsample).ravel() & np.uint32(schema.UNMEASURED)) == 0
     for movie in counts:
         absent = clocks.missing(movie)
@@ -268,15 +265,12 @@ def _on_one_clock(signals: Array, stamps: Array, segment: smooth.Whole, reach: i
 
 
 def _covariances(shared: _Pair, search: int, names: list[str]) -> tuple[Array, Array]:
-    """Covariances of the rapid changes, in groups of pixels.
-
-    C (group, lag) of the bands, with the first one later by each lag up to `search` and two more,
-    either way; R (group, 2) of the first band, one and two frames apart.
-    """
+    """Covariances of rapid changes by group: C (group, lag); R (group, 2) of the first band."""
     # One step at a shutter event of either band, the same for both.
     _, segment = np.unique(shared.segments, axis=1, return_inverse=True)
     common = _common(shared, names)
     first, second = (_rapid(movie, shared.times, common, segment) for movie in shared.signals)
+    # The first band is later by up to `search` lags, and two more that `_delays` needs, either way.
     cross = [_lagged(first, second, common, lag) for lag in range(-search - 2, search + 3)]
     auto = [_lagged(first, first, common, lag) for lag in (1, 2)]
     return np.stack(cross, axis=1), np.stack(auto, axis=1)
@@ -341,10 +335,8 @@ def _peak(cross: Array, label: str) -> int:
 
 
 def _delays(cross: Array, auto: Array) -> Array:
-    """Sub-frame offsets (group, 2) [frame] if they lie in (-1, 0), and in (0, 1).
-
-    The first row is of all groups of pixels, the others omit one group each, for the jackknife.
-    """
+    """Sub-frame offsets (group, 2) [frame], if they lie in (-1, 0), and if in (0, 1)."""
+    # First row: all groups of pixels; each other row omits a group, for the jackknife.
     kept, middle = np.vstack([np.ones(_GROUPS), 1.0 - np.eye(_GROUPS)]), cross.shape[1] // 2
     cross, (near, far) = kept @ cross, (kept @ auto).T
     delays = []
@@ -360,14 +352,15 @@ def _delays(cross: Array, auto: Array) -> Array:
 def bent(
     plan: clocks.Interpolation, pair: Array, times: Array, segment: smooth.Whole, largest: float
 ) -> clocks.Interpolation:
-    r"""Interpolation of a band x with which its rapid changes are as large as the reference y's.
+    r"""Interpolation of a band x whose rapid changes are as large as those of the reference y.
 
-    Products of neighbouring frames tell their ratio k without noise. Total least squares of samples
-    without a step of `largest`, with covariances C, yields k if a share of the bend (else 1) solves
+    Products of neighbouring frames give the ratio k = y / x without noise. Total least squares with
+    covariances C, of samples without a step of `largest`, gives the same k if the share of the
+    cubic's bend (1 where it cannot be estimated) solves
 
     .. math:: \sigma_y^2 (C_{yx} - k C_{xx}) + k \sigma_x^2 (C_{yy} - k C_{yx}) = 0
 
-    The `pair` (2, time, pixel) [count] is of y at the `times` [s], and of x at its own.
+    The `pair` (2, time, pixel) [count] holds y at the `times` [s], and x at its own times.
     """
     timed, valid = present(pair[1]) & np.isfinite(plan.stamps), plan.valid & present(pair[0])
     both, rate = present(pair[0]) & timed, clocks.frame_period(plan.stamps)
@@ -378,17 +371,19 @@ def bent(
         power = np.square(noises.estimate(pair[0, both], pair[1, both], times[both]))
     except ValueError:  # without noise
         return plan
-    # Rapid changes of the reference, of a line, and of the cubic, and samples without a step.
+    # Rapid changes of y, and of x by the line and by the cubic; samples without a step.
     matrices, dot = (plan.matrix(0.0), plan.matrix()), partial(np.einsum, "tp,tp->p")
     films = pair[0], *(matrix @ np.nan_to_num(pair[1]) for matrix in matrices)
     y, line, x = (_rapid(film, times, valid, segment) for film in films)
     replace(plan, swing=np.inf).apply(pair[1], film := np.empty_like(y), largest)
     used = np.isfinite(film)
-    # White noise is in neighbours as it is in the smooth functions; the bend acts alike in pixels.
+    # Without the smooth functions white noise adds -_ORDER / n of its variance to the products of
+    # neighbouring frames: it is taken out.
     pairs = (y, valid), (_rapid(pair[1], plan.stamps, timed, segment), timed)
     autos = [dot(z[1:], z[:-1]) / np.sum(it[1:] & it[:-1]) for z, it in pairs]
     auto_y, auto_x = np.array(autos) + _ORDER / valid.sum() * power[:, np.newaxis]
     late, early = dot(y[1:], x[:-1]), dot(y[:-1], x[1:])
+    # Interpolated frames vary less: scale their products, alike in all pixels, to the samples'.
     cross = 0.5 * (late + early) * np.sqrt(np.sum(auto_y * auto_x) / np.sum(late * early))
     white, forces = used.sum(axis=0) * (1.0 - _ORDER / valid.sum()), []
     for film, matrix in zip((line, x), matrices, strict=True):
@@ -397,8 +392,9 @@ def bent(
         level = (dot(y, y * used) - white * power[0]) * cross - common * auto_y
         force += power[1] * cross.sum() / auto_x.sum() * level
         forces.append([group.sum() for group in np.array_split(force, _GROUPS)])
+    # The share at which no force is left, from the line (0) to the cubic (1); jackknife as above.
     before, after = forces @ np.column_stack([np.ones(_GROUPS), 1.0 - np.eye(_GROUPS)])
-    share, *without = before / (before - after)  # no force is left; jackknife as above
+    share, *without = before / (before - after)
     if np.sqrt((_GROUPS - 1) * np.var(without)) <= _VAGUE and 0.0 <= share <= _MOST_BENT:
         return replace(plan, bend=share * plan.bend, swing=np.inf)
     return plan

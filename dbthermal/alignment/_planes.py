@@ -27,8 +27,8 @@ from dbthermal.alignment._splines import Movie
 
 SMALLEST: Final = 24  # rows and columns of an image whose bands are matched, at least
 _ROWS: Final = 32  # that are read at a time
-_COMMON, _MISSING = 0.5, 0.1  # of pixels that a frame must have, and frames that a pixel may lack
-_PIXELS: Final = 1024  # that tell the frames, about
+_COMMON, _MISSING = 0.5, 0.1  # least share of a frame's pixels, largest of a pixel's missing frames
+_PIXELS: Final = 1024  # pixels, about, by which valid frames are chosen
 # Functions of time: 14 fields of 220 to 300 frames are off by .021 pixel along the baseline (.020
 # with 128, of 36 fields 1.2 and 1.4 times as much with 32 and with whole films); and pixels that
 # tell each of them.
@@ -36,12 +36,12 @@ _PLANES, _FOR_EACH = 96, 8
 # Of displaced windows: frames, number along either side of the image, and their sides [pixel].
 _FRAMES, _ALONG, _SIDES = 400, 8, (8, 16)
 _BLUR: Final = 2.0  # before a displacement is looked for [pixel]
-# Chance below and pixels or frames from which it is a displacement, of so many windows at least.
+# Chance below which, and pixels or frames from which, so many windows or more are displaced.
 _CHANCE, _LEAST, _LEAST_LATE, _FEWEST = 1e-3, 0.3, 0.1, 4
 _STRONG: Final = 3.0  # variance of a window's changes over the noise
 # Functions of time, of a smooth object at most, and of what changes rapidly; pixels that tell them.
 _ORDER, _RAPID_PLANES, _RAPID_PIXELS = 14, 32, 100
-_COMMON_SAMPLES: Final = 0.9  # samples of a pixel over those of others
+_COMMON_SAMPLES: Final = 0.9  # least share of a pixel's samples, over the largest such share
 
 
 @dataclass(frozen=True)
@@ -174,15 +174,13 @@ def white(frames: int, period: float) -> float:
 
 
 def bridged(film: Movie) -> tuple[Movie, Array]:
-    """Film (time, pixel) with missing samples on the line between those before and after.
-
-    Second, the share of samples (pixel) that are measured; a pixel without any is zero.
-    """
+    """Film (time, pixel) with gaps bridged by lines, and the share (pixel) of measured samples."""
     measured = schema.measured(film)
     if measured.all():
         return film, np.ones(film.shape[1])
     result = np.where(measured, film, np.float32(np.nan))
     smooth.bridge(result, measured.any(axis=0))
+    # A pixel without any sample is zero.
     return np.nan_to_num(result, copy=False), measured.mean(axis=0)
 
 
@@ -209,15 +207,14 @@ def _frames(counts: xr.DataArray) -> npt.NDArray[np.intp]:
 def share_displaced(corrected: xr.Dataset, scale: Scale) -> float:
     r"""Share of windows of the image in which the bands show rapid changes apart; 0 if none do.
 
-    Windows are matched by Gauss-Newton steps from no displacement [1], of what no smooth object
-    shows; and of what no object shows that heats within seconds, where reflections are as rapid:
+    A Gauss-Newton step from no displacement [1] matches the windows, of changes that no smooth
+    object shows; and once more of those too rapid for an object that heats within seconds:
 
     .. math:: z_2 = \kappa_w \, (z_1 + d \cdot \nabla z_1)
 
-    Displaced in the image, or in time. Both are seen if one alone is more than that of a poor
-    registration, and they are beyond chance by what they change without one window after another
-    (Hotelling's T-squared of the jackknife): an object's rapid changes displace a window, and so
-    does a border of materials, but not all windows alike.
+    A displacement in the image, or in time, counts if it exceeds that of a poor registration, and
+    chance (Hotelling's T-squared of a jackknife over the windows): an object's rapid changes, or a
+    border of materials, displace a window, but not all windows alike.
 
     References
     ----------
@@ -231,7 +228,7 @@ def share_displaced(corrected: xr.Dataset, scale: Scale) -> float:
 def _share(windows: Array) -> float:
     """Share of windows whose bands are apart, from normal equations A d = g (window, 4, 3)."""
     number, whole, size = len(windows), windows.sum(axis=0), windows.shape[2]
-    # All windows, and those without one after another, have to tell a displacement.
+    # All windows, and all but each window in turn, must determine a displacement.
     sums = np.concatenate([whole[np.newaxis], whole - windows])
     if number < _FEWEST or np.linalg.eigvalsh(sums[:, :size]).min() <= 0.0:
         return 0.0
@@ -248,11 +245,7 @@ def _share(windows: Array) -> float:
 
 
 def _window_equations(corrected: xr.Dataset, scale: Scale) -> list[Array]:
-    """Normal equations A d = g (window, 4, 3) of the displacement of windows with rapid changes.
-
-    Down and right in the image [pixel], and in time [frame]; the ratio of a window is eliminated,
-    and what noise adds is subtracted.
-    """
+    """Normal equations A d = g (window, 4, 3) of shifts down, right [pixel] and in time [frame]."""
     frames = slice(None, None, max(1, corrected.sizes["time"] // _FRAMES))
     noise = scale.noise_of(corrected)
     bands = np.argsort(noise / schema.noise_factor(corrected), kind="stable")[:2]
@@ -264,7 +257,7 @@ def _window_equations(corrected: xr.Dataset, scale: Scale) -> list[Array]:
         """Films (band, time, y, x) [K] of some rows and columns."""
         film = counts[:, :, rows, columns].values[bands].astype(np.float32)
         film[:, :, (np.ptp(film, axis=1) == 0.0).any(axis=0)] = np.nan  # of dead pixels
-        film[:, ~schema.measured(film).all(axis=0)] = np.nan  # of both the same samples
+        film[:, ~schema.measured(film).all(axis=0)] = np.nan  # the same samples in both bands
         flat = film.reshape(2, time.size, -1)
         (first, share), (second, _) = (bridged(block) for block in flat)
         used = share > _COMMON_SAMPLES * share.max()

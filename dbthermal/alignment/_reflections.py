@@ -18,21 +18,22 @@ from dbthermal.alignment._splines import Field, Information, Movie, Spline, binn
 
 _COARSE: Final = 28  # pixels along the shorter side of the coarsest image, at least
 _FEW: Final = 64  # functions of time on the coarsest image
-_START: Final = 20  # the same of the image on which whole pixels are matched
+_START: Final = 20  # pixels along the shorter side for whole-pixel matches, at least
 # Periods [frame] of which slower changes are left out: the shorter, the less an object that heats
 # rapidly enters. A longer one is taken whose field has so many times smaller deviations where the
 # shorter one is known, and a chi-square by the shorter one's data below so much: of people before
 # glass, a wineglass and a coffee pot it was .1 to 3.0, and 6 to 3000 where an object's own changes
 # entered.
 _PERIODS: Final = (5.0, 10.0, 20.0, 80.0)
-_SLOW: Final = 20.0  # those of a delay, at least
+_SLOW: Final = 20.0  # shortest period of which a delay is estimated [frame]
 _MORE, _AGREE = 1.25, 4.5
 _KNOWN: Final = 0.2  # largest deviation of a shift by the data of a window alone [pixel]
 _WIDE: Final = 6.0  # deviation of the window in which a field and its data are compared [pixel]
-_RIDGE: Final = 1e-6  # of the largest information, where there is none
+_RIDGE: Final = 1e-6  # of the largest information, added for windows without any
 # Shift from which the cameras see reflections apart: in standard deviations, and in pixels.
 _SIGMAS, _LEAST_SHIFT = 3.0, 0.1
-# Share of what none leaves that a shift explains: from 0.36; of clouds and heat alone below 0.03.
+# Share of what no shift leaves that a shift must explain: seen 0.36 or more; below 0.03 of clouds
+# and heat alone.
 _EXPLAINED: Final = 0.1
 _NEAR: Final = 0.125  # of the image's smaller side, by which a field is extrapolated
 
@@ -88,7 +89,7 @@ def _matched(corrected: xr.Dataset, capture: Capture) -> xr.Dataset:
     spline = Spline((shape[0], shape[1]), max(shape) / 3.0)
     factor = 2 ** max(0, int(np.log2(min(shape) / _COARSE)))
     capture, tried, period, field = _coarse(capture, spline, factor)
-    # Planes in one look at the films. In slower changes there is more of a delay than noise.
+    # Planes of both periods in one reading of the films: slower changes show more of a delay.
     slow = min((longer for longer in tried if longer >= max(period, _SLOW)), default=max(tried))
     functions = [tried[length] for length in sorted({period, slow})]
     movies, white = capture.planes(functions), planes.white(capture.frames.size, period)
@@ -106,14 +107,14 @@ def _matched(corrected: xr.Dataset, capture: Capture) -> xr.Dataset:
     fine = level(0, 1)
     field, data = matching.refine(fine, field)
     spread = _variances(field, fine, data)
-    # What a rate's planes are of the delay's, by its functions.
+    # Matrix that takes planes to those of their rate of change, by least squares.
     times = corrected["time"].values[capture.frames]
     change = np.asarray(np.gradient(np.eye(times.size), times, axis=0)).T @ functions[-1]
     rate = np.linalg.lstsq(functions[-1], change)[0].astype(np.float32)
     slower = fine if len(movies) == 1 else level(-1, 1)
     place = field.on(fine.centres())
     late, std, energy = matching.delay(slower, rate, place)
-    # Of something else is a shift that explains little of what none leaves.
+    # A shift that explains little of what no shift leaves is not that of the reflections.
     still = matching.delay(slower, rate, np.zeros_like(place))[2]
     moved, rest = np.sum([energy, still], axis=(2, 3), where=energy[1] * still[1] != 0.0)
     if moved[0] - rest[0] <= _EXPLAINED * max(rest[1] - rest[0], 0.0):
@@ -166,7 +167,8 @@ def _coarse(
         gain, distance = np.inf, 0.0
         if before is not None:
             gain = np.mean((sizes - size)[earlier])
-            # A field of slower changes must fit the data of the more robust one if within a pixel.
+            # A field of slower changes must fit the data of the more robust field before it, unless
+            # that field's deviation is a pixel or more: an unknown field vetoes no shift.
             distance = begin.disagreement(before, level.centres(), field)
             distance *= np.mean(sizes[earlier]) < 0.0
         if resolved.any() and gain > np.log(_MORE) and distance < _AGREE:
@@ -187,10 +189,7 @@ def _resolved(data: Information, factor: int = 1) -> Mask:
 
 
 def _variances(field: Field, level: Movies, data: Information) -> Array:
-    """Variance (2, y, x) of a field [pixel^2], times the data's reduced chi-square about the field.
-
-    The field is smoother than the reflection where windows ask for steps beyond their own noise.
-    """
+    """Variance (2, y, x) [pixel^2] of a field, larger where windows ask for steps beyond noise."""
     # Squares of the steps that windows ask for, over their variances.
     area = 4.0 * np.pi * (matching.WINDOW * level.factor) ** 2
     tensor = np.moveaxis(area * data.tensor[[[0, 1], [1, 2]]], (0, 1), (-2, -1))
@@ -200,6 +199,7 @@ def _variances(field: Field, level: Movies, data: Information) -> Array:
     # Their mean around each pixel, where windows resolve the shift.
     resolved = _resolved(data, level.factor)
     blur = partial(gaussian_filter, sigma=_WIDE / level.factor, axes=(-2, -1))
+    # Reduced chi-square, above 1 where the field is smoother than the reflection.
     chi = np.maximum(blur(squares * resolved) / np.maximum(blur(resolved * 1.0), 1e-9), 1.0)
     return np.asarray(chi * field.variances(level.centres()))
 
@@ -215,7 +215,7 @@ def _result(
     measured = _resolved(data) & reached
     distance = np.asarray(distance_transform_edt(~measured))
     near = (distance <= _NEAR * min(shape)) & reached & measured.any()
-    # Away from where it is known the field may change as much as it does there.
+    # Away from known pixels the field may change as much as it does in known pixels.
     slopes = np.square(np.gradient(shift, axis=(1, 2))).sum(axis=0)[:, measured]
     growth = np.multiply.outer(slopes.sum(axis=1) / max(1, measured.sum()), distance**2)
     std = np.sqrt(np.maximum(variance, 0.0) + growth)

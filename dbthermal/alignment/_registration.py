@@ -150,14 +150,12 @@ def _curves(view: xr.DataArray, bad: Mask) -> Array:
 
 
 def _smooth(signal: Array) -> Array:
-    """Fit smooth curves to signals (time, pixel), by Tukey's bisquare weights, at a few times.
-
-    A plain mean holds a share of passing reflections, different in each band, which displaces a
-    warm spot without detail by 0.2 pixel.
-    """
+    """Fit smooth curves to signals (time, pixel), by Tukey's bisquare weights, at a few times."""
     order = min(_ORDER, len(signal))
     functions = polynomial_basis(np.arange(len(signal)), order)
     products = np.einsum("ti,tj->tij", functions, functions).reshape(len(signal), -1)
+    # A plain mean holds a share of passing reflections, different in each band, which displaces a
+    # warm spot without detail by 0.2 pixel.
     weights = np.ones_like(signal)
     for _ in range(_ROBUST_STEPS):
         matrix = (weights.T @ products).reshape(-1, order, order)
@@ -274,7 +272,7 @@ def _start(pair: list[Array], band: str) -> tuple[float, Array]:
         blurred = [gaussian_filter(image, blur) for image in pair]
         films = [image[np.newaxis] for image in blurred]
         matrix = _fitted(films, matrix, _FREE["translation"], blur, band)
-    # What both show at the same place must be alike.
+    # The images must be alike where they overlap.
     places = positions(matrix, pair[0].shape)
     overlap = _overlap(places, band)
     values = sampled(spline_filter(blurred[1])[..., np.newaxis], places[:, overlap])[0]

@@ -25,7 +25,9 @@ MAP: Final = schema.Variable(
 )
 """Transform of a curved surface: for each band where each pixel of the first view lies in it."""
 
-TAPS: Final = 6  # pixels a side that a sample between pixels is made of
+# Pixels a side that make a sample between pixels: half-way 6 keep 95 % of a wave of four pixels and
+# 99.7 % of seven, lines 71 and 90 %.
+TAPS: Final = 6
 _ROUNDING: Final = 1e-7  # weights that are rounding [1]
 _BEYOND: Final = 0.1  # distance from the last pixel's centre at which its line holds [pixel]
 _DIGITS: Final = 9  # of a rounded position, so that a border met exactly counts [pixel]
@@ -77,15 +79,11 @@ def reflected(field: xr.Dataset, corrected: xr.Dataset) -> list[Array]:
 
 
 def interpolation(places: Array, taps: int) -> csr_array:
-    """Weights (pixel, pixel) [1] of samples at rows and columns (2, y, x) [pixel].
-
-    Of Lagrange polynomials through `taps` neighbours a side: half-way between pixels 6 of them keep
-    95 % of a wave of four pixels and 99.7 % of seven, lines keep 71 and 90 %. A place without so
-    many neighbours has no weights, but for `_BEYOND`.
-    """
+    """Lagrange weights (pixel, pixel) [1] of `taps` pixels a side, for places (2, y, x) [pixel]."""
     shape, complete, factors = places.shape[1:], np.ones(places[0].size, dtype=bool), []
     for place, size in zip(places.reshape(2, -1), shape, strict=True):
         within, first, weight = lagrange(place, size, taps)
+        # A place without enough neighbours has no weights, but for `_BEYOND`.
         complete &= within
         factors.append((weight, first[:, np.newaxis] + np.arange(taps, dtype=np.int32)))
     (down, row), (right, column) = factors
@@ -215,7 +213,7 @@ def on_one_clock(
     times, segment = clocks.fill_times(stamps[reference]), schema.segments(corrected)
     # Plan the interpolation of each band, and how it reduces noise.
     plans, factors, thin = [], np.ones(len(names)), -(-signals[0].size // lags.TELLING)
-    # Frames that are NaN, or a copy of the one before, in every block of rows.
+    # Frames that are NaN, or a copy of the frame before, in every block of rows.
     blocks = (counts.isel(y=rows).values for rows in _rows.blocks(counts.shape))
     copies = [[clocks.missing(single(film)) for film in block] for block in blocks]
     missing = np.all(copies, axis=0)

@@ -58,10 +58,8 @@ def blurred(image: Image, width: float) -> Image:
 
 
 def splines(movie: Movie, width: float) -> Movie:
-    """Coefficients of cubic B-splines that are a movie blurred by a width [pixel].
-
-    A B-spline blurs as well: so these are blurred by less, and no filter undoes it.
-    """
+    """Coefficients of cubic B-splines that are a movie blurred by a width [pixel]."""
+    # A B-spline blurs as well, by a part of the width: no filter undoes its blur.
     smooth = blurred(movie, float(np.sqrt(width**2 - _VARIANCE)))
     return np.pad(smooth, ((_EDGE, _EDGE), (_EDGE, _EDGE), (0, 0)), mode="symmetric")
 
@@ -90,18 +88,19 @@ def products(movie: Movie, movies: list[Movie], places: Array, rate: Movie | Non
 def normal_equations(sums: Array, noise: Array) -> Array:
     """Normal equations A d = g (..., 4, 3) of steps down, right and in time, see `products`.
 
-    Of sums (..., 15) over pixels, with a rate; the noise's part of the squares of the moved movie
-    and of its changes (..., 4) is subtracted, half of them at most. The other movie is a ratio of
-    the moved one, which is eliminated.
+    Of sums (..., 15) over pixels, with a rate, less the noise's part (..., 4) of the squares of the
+    moved movie and of its changes.
     """
     rows, columns = np.triu_indices(5)
     full = np.zeros((*sums.shape[:-1], 5, 5))
     full[..., rows, columns] = full[..., columns, rows] = sums
     places = np.arange(4)
     squares = full[..., places, places]
+    # Half of a square, at most, is noise.
     full[..., places, places] -= np.minimum(noise, 0.5 * squares)
     size, cross = full[..., :1, :1], full[..., :1, 1:4]
     size = np.maximum(size, np.finfo(np.float64).tiny)
+    # The ratio of the other movie to the moved one is eliminated.
     ratio = full[..., :1, 4:] / size
     tensor = ratio**2 * (full[..., 1:4, 1:4] - cross.mT * cross / size)
     force = ratio * (full[..., 4:, 1:4] - ratio * cross)
@@ -293,7 +292,7 @@ class Field:
     factor: Array  # of the information, by Cholesky
     penalty: float
     sharpness: Array  # weight of each bending (2, bending) [1]
-    settled: bool  # the penalty is the best of those near it
+    settled: bool  # the penalty is better than the penalties near it
 
     def on(self, centres: list[Array]) -> Array:
         """Displacement (2, y, x) [pixel] at rows and columns."""

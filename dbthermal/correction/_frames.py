@@ -26,8 +26,8 @@ Means = list[Array]  # over parts of the image (time, part), of each band
 _PIXELS, _ROWS_AT_LEAST = 16384, 24  # of a band that are looked at, about
 _SAMPLES: Final = 2**24  # of a band, at most: of a long capture fewer pixels
 _PASSES: Final = 4  # bad frames beside bad frames, as of a shutter that moves, are found in turn
-# Share of the pixels that change where a run of bad frames begins and ends; of those that deviate
-# in it; of a torn row; and of the rows that are torn.
+# Least share of pixels that change where a run of bad frames begins and ends; that deviate in the
+# run; that deviate in a torn row; and of torn rows.
 _EDGE, _MOST, _ROW, _ROWS = 0.08, 0.5, 0.9, 0.1
 _RETURN: Final = 0.5  # largest change across a run of bad frames, relative to its deviation
 _LONGEST, _AT_END = 5.0, 5  # longest run of bad frames [s], at an end of the capture [frame]
@@ -36,15 +36,15 @@ _BLOCKS: Final = (6, 8)  # parts of an image whose means are compared
 _COMES: Final = 0.4  # least share of a deviation that comes with one frame, and goes with one
 _LAGS: Final = 5  # by which the cameras may be apart [frame]
 _SHARED: Final = 0.7  # least correlation of a deviation that two bands see
-# Largest contrast of a shutter, relative to that which the scene has less of in few frames.
+# Largest contrast of a shutter over the scene's; share of frames with less than the scene's.
 _UNIFORM, _FEW = 0.3, 0.1
 _RANDOM: Final = 20.0  # differences of neighbouring pixels, relative to usual ones, of a random one
 _GAIN: Final = float(np.log(1.25))  # least change of a gain that is switched
 _ALIKE: Final = 0.9  # and least correlation of the images before and after
-_NEAR: Final = 10  # frames before and after it whose noise is compared
+_NEAR: Final = 10  # frames before and after a switched gain whose noise is compared
 _WINDOW: Final = 25  # frames before and after a step of the pattern
-_FEWEST: Final = 256  # pixels from which its variance is known within a sixth
-# Variance of a step of the pattern over that of noise, from which it is one.
+_FEWEST: Final = 256  # pixels from which a step's variance is known within a sixth
+# Least variance of a step of the pattern, over that of noise.
 _STEP: Final = 2.5
 # Least share of a step that a single frame brings; this and variance in another band, and mean
 # product of the signs, from which the scene has stepped.
@@ -83,13 +83,11 @@ class Findings:
 
 
 def sampling(counts: xr.DataArray) -> dict[str, slice]:
-    """Rows and columns of counts (band, time, y, x) that are looked at.
-
-    Whole rows, for the detail from pixel to pixel, but in a capture too long for 24 of them.
-    """
+    """Rows and columns of counts (band, time, y, x) that are looked at."""
     shape = counts.sizes["y"], counts.sizes["x"]
     wanted = min(_PIXELS, _SAMPLES // counts.sizes["time"])
     step = stride(shape, wanted)
+    # Whole rows, for the detail from pixel to pixel, but in a capture too long for 24 of them.
     rows = -(-shape[0] * shape[1] // wanted)
     whole = wanted >= _ROWS_AT_LEAST * shape[1] or step == 1
     steps = {"y": rows, "x": 1} if whole else {"y": step, "x": step}
@@ -158,7 +156,7 @@ def _leave_out(
                 valid[band, frames[start:stop]] = False
                 if not uniform[trio[0]]:
                     continue
-                # A shutter moves in the frames beside, in which a part of the image changes.
+                # In the frames before and after, a shutter moves: a part of the image changes.
                 for side, far in ((start - 1, start - 2), (stop, stop + 1)):
                     if 0 <= far < frames.size:
                         change = _changed(film[frames[far]], film[frames[side]], limit)
@@ -178,11 +176,7 @@ def _noise(film: Film) -> float:
 
 
 def _runs(film: Film, limit: np.float32, longest: int) -> Iterator[tuple[int, int, list[int]]]:
-    """Yield first frames, and frames after the last, of unpredicted runs, by length.
-
-    And the frames that prove it: in the middle, and on both sides. At an end of the capture one
-    twice as far away stands for the missing side.
-    """
+    """Yield start and stop of unpredicted runs, by length, and the frames that prove each."""
     changes = [_changed(before, after, limit) for before, after in pairwise(film)]
     edges = (1 + np.flatnonzero(np.array(changes) > _EDGE)).tolist()
     pairs = [(0, stop) for stop in edges[:_ENDS] if stop <= _AT_END]
@@ -191,6 +185,8 @@ def _runs(film: Film, limit: np.float32, longest: int) -> Iterator[tuple[int, in
         pairs += [(start, stop) for stop in ends if stop - start <= longest]
         pairs += [(start, len(film))] if len(film) - start <= _AT_END else []
     for start, stop in sorted(pairs, key=lambda pair: pair[1] - pair[0]):
+        # Compare the middle with both sides; at an end of the capture a frame twice as far away
+        # stands for the missing side.
         before = start - 1 if start > 0 else 2 * stop
         after = stop if stop < len(film) else 2 * start - stop - 1
         places = [(start + stop - 1) // 2, before, after]
@@ -224,11 +220,9 @@ def _changed(before: Film, after: Film, limit: np.float32) -> float:
 
 
 def _is_shared(sections: Means, valid: Mask, band: int, places: Frames, span: Frames) -> bool:
-    """Return whether another band deviates alike, a few frames earlier or later, and as suddenly.
-
-    Of the means of parts of the image (time, part); `places` are a frame and those that it deviates
-    from, `span` the first and last that do, of a step its frame and the one before.
-    """
+    """Return whether another band deviates alike, within a few frames, and as suddenly."""
+    # Places: a frame, and those that it deviates from. Span: first and last deviant frame, or of a
+    # step its frame and the frame before.
     if not _is_sudden(sections[band], places, span, _COMES):
         return True  # the object, or people, who come and go
     deviation = sections[band][places[0]] - sections[band][places[1:]].mean(axis=0)
@@ -255,7 +249,7 @@ def _is_sudden(section: Array, places: Frames, span: Frames, share: float) -> bo
         return bool(np.delete(near, min(first - 1, 1)).max(initial=0.0) < _RETURN * energy)
     sides, across = section[places[1:]], section[places[2]] - section[places[1]]
     comes, goes = section[first] - sides[0], section[last] - sides[1]
-    # At an end of the capture, with both sides on one: no drift.
+    # At an end of the capture both frames lie on one side, where a drift deviates as well.
     ends = (places[1] > places[0]) == (places[2] > places[0])
     drifts = ends and abs(across @ deviation) > _RETURN * energy
     return bool(min(comes @ deviation, goes @ deviation) > share * energy and not drifts)
@@ -327,18 +321,17 @@ def _scores(detail: Film, valid: Mask, renewals: Mask) -> Array:
 
 
 def _change(detail: Film, valid: Mask, frame: int) -> tuple[Film, Array, float]:
-    """Change of the detail (pixel) at a frame, from mean to mean of the frames on both sides.
-
-    And the shares of it that each frame (time) brings, and that stays, where it changes most.
-    """
+    """Change of the detail (pixel) at a frame; shares of it by frame (time), and that stay."""
     before, after = np.flatnonzero(valid[:frame])[::-1], frame + np.flatnonzero(valid[frame:])
     if min(before.size, after.size) == 0:
         return np.zeros(detail.shape[1], dtype=np.float32), np.zeros(len(detail)), 0.0
+    # Means of the frames on both sides, near and far.
     near, far = (
         detail[after[section] if after[section].size else after].mean(axis=0)
         - detail[before[section] if before[section].size else before].mean(axis=0)
         for section in (slice(_WINDOW), slice(_WINDOW, 2 * _WINDOW))
     )
+    # Shares where the detail changes most.
     strong = np.abs(near) > np.median(np.abs(near))
     frames = np.sort(np.concatenate([before[:_WINDOW], after[:_WINDOW]]))
     shares = np.zeros(len(detail))

@@ -102,7 +102,7 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     patterns, stds = list[float](), np.zeros(counts.sizes["band"])
     if "pattern_std" in corrected:
         stds = np.nan_to_num(corrected["pattern_std"].values)
-    # Frames within which a neighbour may change as well: those of 0.2 s, or five if more.
+    # Frames within which a neighbour may change as well: 0.2 s or five frames, the longer.
     time, reach = counts["time"].values.astype(np.float64), _REACH_FRAMES
     if time.size >= MINIMUM_FRAMES:
         reach = max(reach, int(np.ceil(_REACH_SECONDS / float(np.median(np.diff(time))))))
@@ -171,13 +171,11 @@ def _pattern(image: Array) -> float:
 
 
 def mark_repeats(corrected: xr.Dataset, raw: xr.DataArray, *, shutter: bool) -> xr.Dataset:
-    """Mark pixels that are clipped below the end of the raw counts, or frozen for a while.
-
-    Raw counts (band, time, y, x) are not rounded yet. Frames that are NaN in the corrected dataset
-    do not count, and frozen pixels only where frames of a closed `shutter` were taken out.
-    """
+    """Mark pixels that are clipped below the end of the raw counts, or frozen for a while."""
     saturated, frozen = np.zeros((2, raw.sizes["y"], raw.sizes["x"]), dtype=bool)
     row = corrected["counts"].isel(y=slice(1)).values  # a frame is measured as a whole
+    # Raw counts (band, time, y, x) are not rounded yet; frames that are NaN after the correction do
+    # not count. Frozen pixels are told only where frames of a closed shutter were taken out.
     for movie, frames in zip(raw, np.isfinite(row).any(axis=(2, 3)), strict=True):
         clipped, still = _repeats(movie, frames)
         saturated |= clipped
@@ -191,11 +189,7 @@ def mark_repeats(corrected: xr.Dataset, raw: xr.DataArray, *, shutter: bool) -> 
 
 
 def _repeats(movie: xr.DataArray, frames: Mask) -> tuple[Mask, Mask]:
-    """Clipped and frozen pixels (y, x) of one band, from raw counts (time, y, x) of valid `frames`.
-
-    A level on which several pixels have their extreme samples is the camera's: all pixels that
-    reach it are clipped.
-    """
+    """Clipped and frozen pixels (y, x) of a band, from raw counts (time, y, x) at `frames`."""
     image = (movie.sizes["y"], movie.sizes["x"])
     step = max(1, image[1] // _samples.PIXELS)
     middle = movie.isel(y=image[0] // 2, x=slice(None, None, step)).values
@@ -214,6 +208,7 @@ def _repeats(movie: xr.DataArray, frames: Mask) -> tuple[Mask, Mask]:
     moving = ends[0, 0] < ends[1, 0]
     for sign, (end, number, near) in zip((-1, 1), ends, strict=True):
         clipped |= moving & _samples.is_heap(number, near, grain)
+        # A level at which several pixels have their extremes is the camera's: it clips all of them.
         level = end == sign * np.max(sign * end[moving], initial=-np.inf)
         many, about = (values[level].sum() + 1 - level.sum() for values in (number, near))
         clipped |= level & _samples.is_heap(many, about, grain)  # one sample of each makes its end

@@ -73,11 +73,7 @@ def find_shutter(corrected: xr.Dataset, *, closed: xr.DataArray | None = None) -
 def events_of(
     counts: xr.DataArray, repeats: Mask, closed: xr.DataArray | None, steps: Mask | None = None
 ) -> xr.Dataset:
-    """Events, as of `find_shutter`, of frames (band, time) that are copies or `closed`.
-
-    First frames (band, time) of `steps` of the pattern are events of two frames: the place of a
-    step is uncertain by one.
-    """
+    """Events, as of `find_shutter`, of frames (band, time) that repeat, are `closed` or `steps`."""
     shut = np.zeros((counts.sizes["band"], counts.sizes["time"]), dtype=bool)
     if closed is not None:
         closed = laid_on(closed, counts, "the closed frames", "the capture")
@@ -87,6 +83,7 @@ def events_of(
             rule = "Must be (time) or (band, time)"
             raise ValueError(f"Invalid dims {closed.dims} of the closed frames. {rule}.")
         shut |= closed.values
+    # The place of a step of the pattern is uncertain by a frame: an event of two.
     places = () if steps is None else np.argwhere(steps)
     runs = [(str(counts["band"].values[band]), frame - 1, 2, True) for band, frame in places]
     for index, name in enumerate(counts["band"].values):
@@ -161,27 +158,24 @@ def mark_shutter(corrected: xr.Dataset, events: xr.Dataset | None = None) -> xr.
 
 
 def distinct(capture: xr.Dataset) -> tuple[xr.Dataset, Mask]:
-    """Capture without the repetitions of a stream faster than its sensor, and its copies.
-
-    A stream repeats if half of the frames are shown twice or more, r times in the median. Of each
-    frame of the slowest sensor shown m times, m / r are kept, rounded, and at least one: an image
-    that the sensor itself repeats, as behind a closed shutter, stays so (band, time). Of the other
-    bands, the frames shown then; where these were exposed before, `exposure_time` says when.
-    """
+    """Capture without the repetitions of a stream faster than its sensor, and remaining copies."""
     counts = schema.check(capture, "capture")["counts"]
     repeats, frames = copies(counts), np.arange(counts.sizes["time"])
     first = np.maximum.accumulate(np.where(repeats, 0, frames), axis=1)  # showing of each frame
     numbers = [np.unique(row, return_counts=True)[1] for row in first]
     shown = [int(np.median(number)) for number in numbers]
     slowest = int(np.argmax(shown))
+    # A stream repeats if half of its frames are shown twice or more.
     if shown[slowest] < 2:
         return capture, repeats
-    # Places within the showings of a frame, of which every r-th is kept.
+    # Of m showings of a frame keep every r-th, m / r and at least one, with r the median: an image
+    # that the sensor itself repeats, as behind a closed shutter, stays repeated.
     place = frames - first[slowest]
     least = np.maximum(1, np.rint(numbers[slowest] / shown[slowest]))
     least = np.repeat(least, numbers[slowest]) * shown[slowest]
     kept = np.flatnonzero((place % shown[slowest] == 0) & (place < least))
     first, result = first[:, kept], capture.isel(time=kept)
+    # Remaining copies (band, time). Frames of other bands exposed earlier get an `exposure_time`.
     duplicate = np.diff(first, axis=1, prepend=-1) == 0
     if np.any((first != kept) & ~duplicate):
         even = capture["time"].astype(np.float64).expand_dims(band=counts["band"])

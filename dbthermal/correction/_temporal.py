@@ -193,10 +193,7 @@ class Reference:
 
 
 def refer(corrected: xr.Dataset, reference: Reference, *, lazy: bool) -> xr.Dataset:
-    """Counts (band, time, y, x) with the level, and by several patches the gain, of a reference.
-
-    Attribute ``level_reference``: what remains unknown. A warning names patches far off readings.
-    """
+    """Counts (band, time, y, x) with the level, and by several patches the gain, of a reference."""
     counts, names = corrected["counts"], [str(name) for name in corrected["band"].values]
     masks = _good(reference.patches, corrected, "the patches")
     if np.any(few := masks.sum(axis=(1, 2)) < 2):
@@ -217,6 +214,7 @@ def refer(corrected: xr.Dataset, reference: Reference, *, lazy: bool) -> xr.Data
         wanted = curve.counts(temperatures)
         gain = np.polyfit(seen, wanted, 1)[0] if len(seen) > 1 else 1.0
         lines[:, band, 0, 0, 0] = gain, np.mean(wanted - gain * seen)
+        # What remains unknown of the level and the gain.
         errors = np.array([std[band] for std in stds]) / curve.count_slope(temperatures)
         remaining[names[band]] = {"offset_std": float(np.sqrt(np.mean(errors**2) / len(errors)))}
         if len(errors) > 1:

@@ -25,7 +25,7 @@ from dbthermal.separation import _misfit as misfits
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._misfit import Misfit, Reading
 
-_ROUNDS, _STEP, _SETTLED = 8, 4.0, 0.05  # turns, largest step [pixel^2], and share of the last one
+_ROUNDS, _STEP, _SETTLED = 8, 4.0, 0.05  # turns, largest step [pixel^2], last step over the sum
 _AROUND: Final = 13  # pixels along a side of a neighbourhood with one error of the ratio
 # Side [pixel] of what is one material, its largest ratio over the smallest, and the share of the
 # pixels that must be so.
@@ -103,17 +103,14 @@ def equalise(
 
 
 def _blur_rapid(film: npt.NDArray[np.float32], inputs: Inputs, deviation: float) -> Array:
-    """Blur the rapid changes of a film (time, y, x), in place.
-
-    Returns the root mean square (y, x) over time of what a blur makes of all else, and of the
-    rapid changes that it would take from outside the image.
-    """
+    """Blur rapid changes of a film (time, y, x), in place; return rms errors (y, x) over time."""
     valid = np.isfinite(film) & inputs.good
     filled = np.stack([without_gaps(*pair) for pair in zip(film, valid, strict=True)])
     functions = misfits.smooth_functions(inputs, np.ones(len(film), dtype=bool)).astype(np.float32)
     maps = np.tensordot(functions.T, filled, 1)
     change = np.stack([_blurred(image, deviation) - image for image in maps])
     outside = 1.0 - ndimage.gaussian_filter(np.ones(film.shape[1:]), deviation, mode="constant")
+    # Errors: the blur of the smooth functions, and rapid changes from outside the image.
     square = np.sum(change.astype(np.float64) ** 2, axis=0)
     for frame, values, used, coefficients in zip(film, filled, valid, functions, strict=True):
         blurred = _blurred(values, deviation) - np.tensordot(coefficients, change, 1)
@@ -172,10 +169,7 @@ def _equations(
     reading: Reading,
     leading: int | None = None,
 ) -> Sums:
-    """Normal equation of c over some rows, for bands that are blurred by an excess before.
-
-    Of all rapid changes, or of a leading number of functions of time that hold most of them.
-    """
+    """Normal equation of c over some rows, of bands blurred by an excess [pixel^2] before."""
     rows, _, films, frames, pixels, gain = reading
     shape = (rows.stop - rows.start, result.sizes["x"])
     ratio = result["reflection_ratio"].values[inputs.bands[place], rows]
@@ -189,6 +183,7 @@ def _equations(
     used &= within | (np.count_nonzero(used & within) < _MOSTLY * np.count_nonzero(used))
     blurs = np.sqrt(_COMMON + np.array([max(excess, 0.0), max(-excess, 0.0)]))
     basis = misfits.smooth_functions(inputs, frames)
+    # Leading functions of time hold most of the rapid changes, at less cost.
     if leading is not None:
         changes = films[0][:, pixels]
         changes = smooth.leading((changes - basis @ (basis.T @ changes)).T, leading)
@@ -200,7 +195,7 @@ def _equations(
     def rapid(film: Array) -> Array:
         return film - np.tensordot(basis, np.tensordot(basis.T, film, 1), 1)
 
-    # Where the ratio is not that of the pixels around, or none, broad parts do not compare.
+    # Mask and divide before a blur: broad parts do not compare where ratios differ or are missing.
     first, second = (
         np.stack([_details(image * part, blur) for image in films[order].reshape(-1, *shape)])
         for order, part, blur in zip((0, place), (moving, moving / ratio), blurs, strict=True)

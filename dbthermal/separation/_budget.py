@@ -157,15 +157,13 @@ def _add(
 
 
 def _enter(budget: Array, deviations: dict[str, Array], stds: Array, total: Array) -> None:
-    """Enter parts into a budget (cause, ...), and the calibration's into the deviations, in place.
-
-    Of the statistical deviation, whose root mean square is `total`, what neither the ratio nor a
-    drift explains is noise. A part without a value, as where there is no temperature, is left out.
-    """
+    """Enter deviations into a budget (cause, ...), and add the calibration's to stds, in place."""
+    # A part without a value, as where there is no temperature, counts as zero.
     values = dict.fromkeys(CAUSES, np.zeros(total.shape)) | {
         name: np.where(np.isfinite(deviation), deviation, 0.0)
         for name, deviation in deviations.items()
     }
+    # Noise is what ratio and drift do not explain of the statistical deviation, `total`.
     square = total**2
     for name in ("drift", "ratio"):
         values[name] = np.sqrt(np.fmin(values[name] ** 2, np.nan_to_num(square)))
@@ -179,14 +177,12 @@ def _enter(budget: Array, deviations: dict[str, Array], stds: Array, total: Arra
 
 
 def _weights(value: Array, noise: Array, single: Any, reference: int) -> Array:
-    """Weights (2, band, y, x) of the bands' errors in object and background, by emissivities.
-
-    By least squares; where `single`, or bands do not differ, of the reading in the reference band.
-    """
+    """Weights (2, band, y, x) of the bands' errors in object and background, by emissivities."""
     inverse, cold = 1.0 / noise[:, np.newaxis, np.newaxis] ** 2, 1.0 - value
     pairs = ((value, value), (value, cold), (cold, cold))
     xx, xy, yy = ((inverse * a * b).sum(axis=0) for a, b in pairs)
     single = single | ~(xx * yy - xy**2 > _SINGULAR * xx * yy)
+    # Least squares of the bands; of a single band, or bands alike, the reading of the reference.
     divisor = np.where(single, 1.0, xx * yy - xy**2)
     solution = np.stack([value * yy - cold * xy, cold * xx - value * xy]) * inverse / divisor
     alone = np.zeros_like(solution)

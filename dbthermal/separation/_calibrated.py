@@ -79,11 +79,9 @@ def separate(tile: Tile, settings: CalibratedSettings) -> Estimate:
 
 
 def _gray(emissivity: Array, covariance: Array) -> Mask:
-    r"""Pixels (pixel) of which no band differs for certain from the first.
-
-    The system is singular where :math:`\kappa_m = (1 - e_m) / (1 - e_1)` is 1, whose error counts.
-    """
+    """Pixels (pixel) of which no band differs for certain from the first."""
     dark = 1.0 - emissivity
+    # At a ratio (1 - e_m) / (1 - e_1) of 1 the system is singular; the ratio's error counts.
     ratio = dark / dark[0]
     squares = np.einsum("bbp->bp", covariance)
     variance = squares + ratio**2 * squares[0] - 2.0 * ratio * covariance[0]

@@ -13,17 +13,17 @@ from dbthermal.noise import MAD
 from dbthermal.schema import Status
 from dbthermal.separation._tiles import RANGE_SIGMAS
 
-_FRAMES: Final = 200  # about as many frames and pixels tell
+_FRAMES: Final = 200  # frames and pixels, about, that are judged by the response
 _PIXELS: Final = 2_500
-_OUTSIDE: Final = 0.01  # share of samples outside the calibration that is told
-_HARDLY: Final = 0.1  # share of the moving pixels
+_OUTSIDE: Final = 0.01  # share of samples outside the calibration that gives a warning
+_HARDLY: Final = 0.1  # share of moving pixels without a flag, below which a warning is given
 _REASONS: Final = 3  # flags that are named
-_SAMPLES: Final = 2**24  # of a band that tell a step of a camera's level, at most
-_FEWEST: Final = 100  # pixels that tell it
+_SAMPLES: Final = 2**24  # of a band, in which a step of a camera's level is sought, at most
+_FEWEST: Final = 100  # pixels in which such a step is sought, at least
 _PAUSE: Final = 1.5  # frame periods, from which two frames do not follow one another
-_AROUND: Final = 9  # frames whose median change is the scene's that goes on
-# Deviations of a step by noise, and by flicker, of which 280 frames have up to 3.7; share of it,
-# and deviations, of what another band shows of the scene.
+_AROUND: Final = 9  # frames whose median change is a lasting one of the scene
+# Least step in deviations of noise, and of flicker, of which 280 frames have up to 3.7; share of a
+# step that another band may show, with so many deviations of its noise.
 _CERTAIN, _RARE, _SHARE, _SIGMAS = 16.0, 6.0, 0.15, 4.0
 _EVEN: Final = 0.5  # difference of mean and median, relative to a step of all pixels
 
@@ -71,7 +71,7 @@ def of_one_camera(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
     joined = np.diff(time) < _PAUSE * np.median(np.diff(time))
     joined &= np.diff(schema.segments(corrected)) == 0
     films = counts[:, :, ::step, ::step].values.reshape(*counts.shape[:2], -1)
-    # Samples of all bands: one clock's resampling leaves out those of one band where much moves.
+    # Samples that all bands have: on one clock a resampled band lacks samples where much moves.
     valid = schema.measured(films).all(axis=0)
     valid = valid[1:] & valid[:-1]
     number = valid.sum(axis=1)
@@ -82,7 +82,7 @@ def of_one_camera(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
     slopes = np.array([[it.reference_slope] for it in responses.curves(response, names)])
     with np.errstate(invalid="ignore"):
         changes = np.where(valid, np.diff(films, axis=1), np.nan)  # [count]
-    # Less what goes on; a quartile lies 0.67 deviations of a pixel beside the median.
+    # Changes less lasting ones of the scene; a quartile lies 0.67 deviations from the median.
     ordered = np.sort(changes, axis=2)  # NaN last
     ranks = (np.array([0.25, 0.5, 0.75]) * np.maximum(number[:, np.newaxis] - 1, 0)).astype(np.intp)
     quartiles = np.take_along_axis(ordered, ranks[np.newaxis], axis=2)
@@ -98,7 +98,7 @@ def of_one_camera(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
     for place, size in enumerate(np.abs(mean)):
         single = np.all(np.delete(unseen, place, axis=0) < _SHARE * size, axis=0)
         single &= size > max(_CERTAIN * noise[place], _RARE * flicker[place])
-        # In proportion to what moves, as a median is not; which is the same if all pixels step.
+        # A part of the image that moves changes the mean but not the median; a camera changes both.
         single &= np.abs(median[place] - mean[place]) < _EVEN * size
         if single.any():
             frame = int(np.argmax(size * single))

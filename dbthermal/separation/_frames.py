@@ -47,10 +47,7 @@ def newton(polynomial: tuple[float, ...], target: float, x: float) -> tuple[floa
 
 @kernels.compiled
 def bridge(values: Array, variance: Array, time: Array) -> int:
-    """Bridge the NaN of a curve by lines, its ends by the nearest frame, in place; their number.
-
-    The variance grows as that of a random walk of the curve's own steps.
-    """
+    """Fill the NaN of a curve by lines, its ends by the nearest frame; return their number."""
     last, rate, missing, left = -1, 0.0, 0, -1
     for t in range(time.size):
         if np.isnan(values[t]):
@@ -59,6 +56,7 @@ def bridge(values: Array, variance: Array, time: Array) -> int:
         if last >= 0:
             rate += (values[t] - values[last]) ** 2 / (time[t] - time[last])
         last = t
+    # The variance grows as that of a random walk of the curve's own steps.
     rate /= max(time.size - missing - 1, 1)
     for right in range(time.size + 1 if last >= 0 else 0):
         if right < time.size and np.isnan(values[right]):

@@ -26,13 +26,13 @@ Labels = npt.NDArray[np.intp]
 
 BLOCK_ROWS: Final = 32
 """Rows that are read at once: a lazy capture is then decoded about once."""
-# Samples of a band in these rows, at most: of a long capture they are fewer.
+# Samples of a band in a block of rows, at most: of a long capture it has fewer rows.
 _TOGETHER: Final = 2**24
 
 # Pixels from which the noise is estimated, and a clock is judged.
 _NOISE_PIXELS, _CLOCK_PIXELS = 4096, 256
 _NOISE_SAMPLES: Final = 2**19  # of a band, at most: fewer prove no noise 1.4 times the stated
-# Mean steps, by which a time may be off an even clock, unlooked at.
+# Deviation from an even clock up to which times are not judged by the signals [mean step].
 _NEARLY_EVEN: Final = 1.0
 _READ: Final = ("counts", "status", "segment", "noise_factor", "pattern_std")
 _SEEN: Final = 4096  # pixels, about, by which a frame is seen to be measured

@@ -51,7 +51,7 @@ class Reading(NamedTuple):
 
     rows: slice
     signals: Array  # (band, frame, pixel) [K]
-    reflections: Array  # the same less the object's signal, of pixels without a flag
+    reflections: Array  # signals less the object's signal, in pixels without a flag
     frames: Mask  # that are read (time)
     pixels: Mask  # without a flag (pixel)
     gain: Array  # noise over that of a sample (band, pixel) [1]
@@ -67,7 +67,7 @@ class Misfit:
 
     leak: Array  # deviation of the object's signal over that of the reflection (y, x) [1]
     change: Array  # deviation of the object's signal, at any time (y, x) [K]
-    single: Array  # the same, by noise of single pixels that is not white (y, x) [K]
+    single: Array  # deviation of that signal by noise of single pixels that is not white (y, x) [K]
     answers: dict[Probe, list[Any]]  # to each probe, of the rows that it asks
 
     @property
@@ -87,7 +87,7 @@ class _Blocks(NamedTuple):
     pixels: Array  # their number
     noise: Array  # variances of remainder and reflection, and their covariance (3, ...) [K^2]
     rough: Array  # variance of the remainder's means in time, and its part of noise (2, ...) [K^2]
-    single: Array  # the same of single pixels, by differences of neighbours (2, ...) [K^2]
+    single: Array  # such variances of single pixels, by differences of neighbours (2, ...) [K^2]
     products: Array  # remainder times reflection, and reflection squared (2, event, ...) [K^2]
     freedom: Array  # degrees of freedom of each event (event, ...)
 
@@ -231,10 +231,8 @@ def _single_pixels(
     column: Whole,
     blocks: int,
 ) -> Array:
-    """Variances (2, block) of single pixels' means in time: as they are, and of white noise [K^2].
-
-    By differences of neighbours, which have the object's rapid changes in common.
-    """
+    """Variances (2, block) [K^2] of single pixels' means in time: measured, and of white noise."""
+    # Differences of neighbours, which have the object's rapid changes in common.
     middle = np.flatnonzero(column[:-1] % _BLOCK == 1)
     alike = (place[middle - 1] == place[middle]) & (place[middle] == place[middle + 1])
     middle = middle[alike & (place[middle] >= 0)]
@@ -255,10 +253,7 @@ def _stated(inputs: Inputs, result: xr.Dataset, rows: slice, pixels: Mask) -> Ar
 
 
 def read(inputs: Inputs, result: xr.Dataset, rows: slice) -> tuple[Array, Mask, Mask, Array]:
-    """As `tiles.read`, with an object that changes rapidly at the place of the first band.
-
-    What displaced cameras see of it is resampled as a product: :math:`W [e_m U_m(x)]`.
-    """
+    """As `tiles.read`, with an object that changes rapidly at its place in the first band."""
     signals, frames, pixels, gain = tiles.read(inputs, rows)
     if inputs.displacement is None or not inputs.division.any():
         return signals, frames, pixels, gain
@@ -268,6 +263,7 @@ def read(inputs: Inputs, result: xr.Dataset, rows: slice) -> tuple[Array, Mask, 
     within = slice(rows.start - source.start, rows.stop - source.start)
     missing = ~np.isfinite(film).all(axis=0)
     pixels &= abs(weights) @ missing.ravel() == 0.0
+    # Displaced cameras see the object resampled as a product: W [e_m U_m(x)].
     for order, band in enumerate(inputs.bands[1:], 1):
         curve = inputs.curves[band]
         emitted = curve.signal(np.where(missing, curve.reference, film)) - curve.reference
@@ -279,20 +275,18 @@ def read(inputs: Inputs, result: xr.Dataset, rows: slice) -> tuple[Array, Mask, 
 
 
 def reflected(inputs: Inputs, result: xr.Dataset, rows: slice) -> Reading:
-    """Read some rows, and take the object's signal from those of pixels without a flag.
-
-    It is a cubic polynomial of the temperature over the object's range, of each pixel.
-    """
+    """Read some rows, and take the object's signal from those of pixels without a flag."""
     signals, frames, pixels, gain = read(inputs, result, rows)
     film = result["object_temperature"].values[:, rows].reshape(len(frames), -1)[frames]
     emissivity = result["emissivity"].values[inputs.bands, rows].reshape(len(signals), -1)
-    # A sample that was bridged has no object, which goes on between those around it.
+    # A bridged sample has no object temperature: it is interpolated between measured samples.
     pixels &= (result["status"].values[rows].ravel() == 0) & np.isfinite(emissivity).all(axis=0)
     finite = np.isfinite(film)
     pixels &= np.mean(finite, axis=0) > 1.0 - MOST_BRIDGED
     film = film if finite.all() else smooth.bridge(film, pixels)
     lowest, highest = film.min(axis=0), film.max(axis=0)
     center, half = 0.5 * (lowest + highest), np.maximum(0.5 * (highest - lowest), 1.0)
+    # The object's signal is a cubic polynomial of its temperature, over its range in each pixel.
     nodes, powers = center + _NODES[:, np.newaxis] * half, np.vander(_NODES, increasing=True)
     reflections = signals.copy()
     for order, band in enumerate(inputs.bands):
@@ -343,15 +337,13 @@ def _length(frames: int) -> int:
 
 
 def _weights(ratio: Array, deviation: Array) -> tuple[Array, Array]:
-    """Weights (band, pixel) of the bands for the object's signal, at the least noise.
-
-    And the variances (3, pixel) of their sum and of the reflection, and the covariance [K^2].
-    """
+    """Weights (band, pixel) for the object's signal at the least noise; variances (3, pixel)."""
     contrast = (1.0 - ratio[1:]) / ratio[1:]
     weights = contrast / ((deviation[1:] / ratio[1:]) ** 2 + deviation[0] ** 2)
     weights /= np.sum(weights * contrast, axis=0)
     every = np.concatenate([-weights.sum(axis=0, keepdims=True), weights / ratio[1:]])
     total, first = np.sum((every * deviation) ** 2, axis=0), deviation[0] ** 2
+    # Variances of the weighted sum and of the reflection, and their covariance [K^2].
     return every, np.stack([total, first, every[0] * first])
 
 
@@ -376,11 +368,9 @@ def _average(
 
 @compiled
 def _compare(signals: Array, weights: Array, middle: Whole, segment: Whole, length: int) -> Array:
-    """Variances (2, middle) of means over so many frames, by second differences [K^2].
-
-    Of three pixels in a row, by the middle one: of means in time, and of frames over their number,
-    which are the same for noise that is independent in time. None spans a shutter event.
-    """
+    """Variances (2, middle) [K^2] of means over `length` frames, and of frames over `length`."""
+    # Of second differences over three pixels in a row and in time, none across a shutter event;
+    # both variances are the same for noise that is independent in time.
     result = np.zeros((2, middle.size))
     for i in range(middle.size):
         p = middle[i]
@@ -406,7 +396,7 @@ def _compare(signals: Array, weights: Array, middle: Whole, segment: Whole, leng
                     result[0, i] += (total - 2.0 * mean_last + mean_before) ** 2
                     number[0] += 1.0
                 mean_before, mean_last, total = mean_last, total, 0.0
-        # Either second difference, of independent noise, has six times the variance.
+        # A second difference of independent noise has six times its variance, two in turn 36 times.
         for kind in range(2):
             result[kind, i] /= 36.0 * max(number[kind], 1.0)
     return result

@@ -150,7 +150,7 @@ def _rapid(corrected: xr.Dataset, inputs: Inputs) -> Array:
             for place, ratio in enumerate(ratios, 1)
         ]
         form, force = (np.sum([pair[it] for pair in pairs], axis=0) for it in (0, 1))
-        # Is there any? A growth is no evidence: heat that spreads feigns one, with up to 76.
+        # Is there motion? A growth is no evidence: spreading heat feigns growth, with up to 76.
         before = np.swapaxes(path, 0, 1).reshape(len(basis), -1)
         steps, variance = jackknife(form, force, precision, before)
         score = np.median(quotient(steps**2, variance, 0.0), axis=0).reshape(len(bands), -1)
@@ -160,7 +160,7 @@ def _rapid(corrected: xr.Dataset, inputs: Inputs) -> Array:
         path += np.clip(steps, -_STEP, _STEP)
         if np.sqrt(np.mean(steps**2)) < _SETTLED:
             break
-    # The motion of lost frames lies between those before and after.
+    # The motion of lost frames is interpolated between the frames before and after.
     every, places = np.arange(frames.size), np.flatnonzero(frames)
     motion[bands] = np.apply_along_axis(lambda course: np.interp(every, places, course), 1, path)
     return motion
@@ -220,11 +220,7 @@ def _equations(
     basis: Array,
     repeats: int,
 ) -> tuple[Array, Array, list[Array]]:
-    """Normal equations (window, frame, ...) of the motion, by a band and the first one.
-
-    At ratios (pixel) of each window; and what that leaves (pixel), its energies over those of
-    noise, by which a pixel weighs less.
-    """
+    """Normal equations (window, frame, ...) of the motion between a band and the first one."""
     noise, course = inputs.noise[inputs.bands], basis[:, :_SLOW]
     combinations = []
     for (rapid, slopes), ratio in zip(changes, ratios, strict=True):
@@ -234,6 +230,7 @@ def _equations(
         deviation = np.sqrt((noise[place] / ratio) ** 2 + noise[0] ** 2)
         slope = slopes * (weights / deviation)[:, np.newaxis, np.newaxis]
         combinations.append((null / deviation, slope.reshape(-1, _SLOW, slope.shape[-1])))
+    # Energy (pixel) that the motion leaves, over that of noise, by which a pixel weighs less.
     energies = [np.mean(null**2, axis=0) for null, _ in combinations]
     for _ in range(repeats):
         forms, forces = list[Array](), list[Array]()
@@ -283,18 +280,16 @@ def _course(time: Array) -> Array:
 
 
 def drift(inputs: Inputs, result: xr.Dataset, reading: Reading) -> list[tuple[Array, Array]] | None:
-    """Normal equations (window, ...) of each other band's motion and delay along functions of time.
-
-    Of windows of some rows; what does not change rapidly has no part in them.
-    """
+    """Normal equations (window, ...) of other bands' motion and delay along functions of time."""
     blocks = [rows for rows in inputs.blocks if rows.stop - rows.start > 1]
     blocks = blocks[:: max(1, len(blocks) // _WINDOWS)]
-    # Of cameras apart parallax that changes as people come and go is like motion.
+    # Before cameras apart, parallax changes as people come and go, which looks like motion.
     small = min(result["status"].shape) < 2 * _WINDOWS
     if inputs.displacement is not None or small or reading.rows not in blocks:
         return None
     ratios = result["reflection_ratio"].values[inputs.bands, reading.rows].astype(np.float64)
     pixels = reading.pixels.reshape(ratios.shape[1:])
+    # Only rapid changes have a part in the equations.
     basis = smooth_functions(inputs, reading.frames)
     # Rapid changes in some frames, and in those before and after them.
     at = np.arange(1, len(basis) - 1, -(-len(basis) // _FRAMES))

@@ -87,13 +87,11 @@ def along(slopes: Array, places: Array) -> Array:
 
 
 def sources_of(step: Array, places: Array, pixels: Whole | None = None) -> Array:
-    """Places (axis, ...) [pixel] in an image that become pixels of the image moved by a step.
-
-    Of the pixels at places, counted from the first of these, or with stated pixels (axis, ...).
-    """
+    """Places (axis, ...) [pixel] in an image that become pixels of the image moved by a step."""
     down, right, turn, growth = step
     y, x = places
     displacement = np.stack([down + turn * x + growth * y, right - turn * y + growth * x])
+    # Pixels are counted from the first of the places, or stated (axis, ...).
     return np.asarray((np.indices(y.shape) if pixels is None else pixels) - displacement)
 
 
@@ -134,10 +132,8 @@ def solved(form: Array, force: Array) -> Array:
 
 
 def jackknife(form: Array, force: Array, prior: Array, before: Array) -> tuple[Array, Array]:
-    """Solution of normal equations (window, ...) with a prior, and its variance by a jackknife.
-
-    The prior is on the sum of the solution and what was solved before.
-    """
+    """Solution of normal equations (window, ...) with a prior, and its variance by a jackknife."""
+    # The prior is on the sum of this solution and what was solved before.
     whole, total = form.sum(axis=0) + prior, force.sum(axis=0) - before @ prior
     reduced = solved(whole - form, total - force)
     return solved(whole, total), np.var(reduced, axis=0) * (len(reduced) - 1)
@@ -191,13 +187,11 @@ def overlay(corrected: xr.Dataset, inputs: Inputs) -> Laid | None:
 
 
 def _slow_maps(corrected: xr.Dataset, inputs: Inputs, frames: Whole) -> tuple[Array, Array]:
-    """Coefficients (band, function, y, x) [K] of slow functions of time, of some frames.
-
-    And what a drift along time brings of each (..., function) into those without the mean.
-    """
+    """Maps (band, function, y, x) [K] of slow functions of time in some frames; their drift."""
     counts, good = corrected["counts"], inputs.good
     course = smooth.polynomial_basis(corrected["time"].values[frames], _HIGHEST)
     slow = course[:, :_ORDER]
+    # What a drift along time brings of each (..., function) into the functions without the mean.
     drift = (slow[:, 1:] * slow[:, [1]]).T @ slow / np.abs(slow[:, 1]).max()
     weights, span = course.T.astype(np.float32), slice(frames[0], frames[-1] + 1)
     used = span if span.stop - span.start == frames.size else frames
@@ -218,10 +212,7 @@ def _detail(values: Array) -> Array:
 
 
 class _Views:
-    """Windows of maps (function, y, x) of two bands, blurred, to be laid on one another.
-
-    The slopes (parameter, ...) are those of a motion, and of a drift down and to the right.
-    """
+    """Windows of maps (function, y, x) of two bands, blurred, to be laid on one another."""
 
     def __init__(
         self, first: Array, second: Array, drift: Array, pixels: Whole, blur: float
@@ -230,11 +221,12 @@ class _Views:
         self.images = gaussian_filter(second[1:], blur, axes=(1, 2))
         self.splines = [spline_filter(image, mode="mirror") for image in self.images]
         self.pixels, self.places = pixels, places_of(first.shape[1:])[:, *pixels]
-        # The slopes are the first's, whose noise is not that of the others.
+        # Slopes of the first band: their noise is independent of the other band's.
         slopes = gradients(smoothed)[:, :, *pixels]
         self.detail = _detail(smoothed[1:, *pixels])
         self.energy = np.sum(self.detail**2, axis=(0, 2))
         drifting = np.einsum("jk,akwp->ajwp", drift, slopes)
+        # Slopes (parameter, ...) of a motion, and of a drift down and to the right.
         slopes = _detail(np.concatenate([along(slopes[:, 1:], self.places), drifting]))
         common = quotient(np.sum(slopes * self.detail, axis=(1, 3)), self.energy, 0.0)
         self.slopes = slopes - common[:, np.newaxis, :, np.newaxis] * self.detail
@@ -267,10 +259,7 @@ class _Views:
 
 
 def _displacement(first: Array, second: Array, drift: Array, noise: Array) -> tuple[Array, Array]:
-    """Motion (parameter) [pixel] that lays maps (function, y, x) on the first, and its variance.
-
-    Both are zero if there is none that is sure, matters, and explains what the bands do not share.
-    """
+    """Motion (parameter) [pixel] that lays maps (function, y, x) on the first, and its variance."""
     # Choose the windows of most detail, which changes as the object does: all in slow functions.
     height, width = (size // _SIDE for size in first.shape[1:])
     corners = np.indices((height, width)).reshape(2, -1, 1) * _SIDE
@@ -303,8 +292,9 @@ def _displacement(first: Array, second: Array, drift: Array, noise: Array) -> tu
             path = path + np.clip(step, -_STEP, _STEP)
             if np.sqrt(np.mean(step**2)) < _SETTLED:
                 break
-    # Compare what the bands do not have in common with what they had not before.
+    # Compare what the bands do not have in common with the motion and without it.
     after, before = (np.sum(views.compared(it)[1] ** 2, axis=(0, 2)) for it in (path, none))
     explained = np.median(quotient(after[alike], before[alike], 1.0)) < _LEFT
     sure = np.any(quotient(path**2, spread, 0.0) > SURE)
+    # No motion that is unsure, too small to matter, or does not explain the difference.
     return (path, spread) if sure and explained and size_of(path) > _LEAST else (none, none)

@@ -111,16 +111,12 @@ def too_few(valid: Mask, fewest: int, most_missing: float = MOST_MISSING) -> Mas
 
 
 def bridge(counts: Array, valid: Mask, time: Array) -> tuple[Array, Mask]:
-    """Bridge short gaps of single pixels by a line in all bands.
-
-    The same two frames in all bands hold the same mixture of object and background. Bridged are
-    gaps of up to `LONGEST_GAP` frames, or `LONGEST_SHARE` of the capture, in pixels with few gaps,
-    in frames that most pixels have. Returns the counts, and the samples that are valid or bridged.
-    """
+    """Bridge short gaps of single pixels by lines; return counts and usable samples."""
     if valid.all():
         return counts, valid
     sampled = valid.mean(axis=0) > MOST_MISSING  # beside an object most pixels have no samples
     common = valid[:, sampled].sum(axis=1) > MOST_MISSING * sampled.sum()
+    # Gaps in frames that most pixels have, of pixels with few gaps.
     gap = ~valid & common[:, np.newaxis]
     gap &= gap.sum(axis=0) < MOST_BRIDGED * len(valid)
     if not np.any(gap):
@@ -132,7 +128,8 @@ def bridge(counts: Array, valid: Mask, time: Array) -> tuple[Array, Mask]:
     before = np.maximum.accumulate(np.where(valid[:, selected], places, -len(valid)))[frame, place]
     after = np.where(valid[::-1, selected], places, -len(valid))
     after = len(valid) - 1 - np.maximum.accumulate(after)[::-1][frame, place]
-    # A line between them, if they are near.
+    # A line between near frames, the same in all bands: they hold the same mixture of object and
+    # background.
     longest = max(LONGEST_GAP, int(LONGEST_SHARE * len(valid)))
     short = after - before <= longest + 1
     frame, pixel, first, last = (band[short] for band in (frame, pixel, before, after))
@@ -164,34 +161,29 @@ def frame_sets(valid: Mask, status: Bits) -> Iterator[tuple[Mask, Mask]]:
 def common_frames(
     counts: Array, valid: Mask, status: Bits, fewest: int = 1
 ) -> list[tuple[Mask, Mask]]:
-    """Frames (time) that most pixels have, and the pixels (pixel) that have them all.
-
-    A usable pixel that lacks one gets the bit of invalid samples and counts of zero, in place; so
-    do all where the frames are fewer than `fewest`, and then the list is empty.
-    """
+    """Frames (time) that most pixels have, and the pixels (pixel) that have them all."""
     usable = ~unusable(status)
     if not np.any(usable):
         return []
     frames = np.mean(valid[:, usable], axis=1) > MOST_MISSING
     enough = frames.sum() >= fewest
     complete = usable & enough & np.all(valid[frames], axis=0)
+    # Flag and clear, in place, pixels that lack a frame; all pixels where frames are too few.
     status[usable & ~complete] |= np.uint32(Status.INVALID_SAMPLES)
     counts[:, :, usable & ~complete] = 0.0
     return [(frames, complete)] if np.any(complete) else []
 
 
 def sample(corrected: xr.Dataset, pixels: int) -> tuple[Array, Mask]:
-    """Read about so many good pixels, evenly spaced over the image; fewer of a long capture.
-
-    Returns the counts (band, time, pixel) [count] of pixels without any bit but that of frozen
-    frames, at the frames that most of them have, and these frames (time).
-    """
+    """Counts (band, time, pixel) [count] of about so many good pixels, and their frames (time)."""
     length = corrected.sizes["time"]
     if length > _LONG:  # the step is rounded down: up to four times as many pixels are read
         pixels = max(1, pixels * _LONG // (4 * length))
     step = stride((corrected.sizes["y"], corrected.sizes["x"]), pixels)
+    # Pixels on an even grid, at the frames that most of them have.
     every = slice(None, None, step)
     counts, valid, status = read(corrected.isel(y=every, x=every))
+    # Good pixels have no bit but that of frozen frames.
     good = (status & ~np.uint32(Status.FROZEN_FRAMES)) == 0
     frames = np.mean(valid[:, good], axis=1) > MOST_MISSING if np.any(good) else good[:0]
     good &= np.all(valid[frames], axis=0) if np.any(good) else False
@@ -199,10 +191,8 @@ def sample(corrected: xr.Dataset, pixels: int) -> tuple[Array, Mask]:
 
 
 def _frozen(same: list[Mask], valid: Mask, chances: list[float]) -> tuple[Mask, Mask]:
-    """Pixels (pixel) frozen in a band or all, and frames (time) in which a band is a copy.
-
-    Of the samples that repeat the one before, by band.
-    """
+    """Pixels (pixel) frozen in a band or all, and frames (time) in which a band is a copy."""
+    # `same`: samples that repeat the sample before, by band.
     copied = [samples.copies(*pair, valid) for pair in zip(same, chances, strict=True)]
     pixels = samples.frozen(reduce(np.logical_and, same), float(np.prod(chances)))
     for band, copy, chance in zip(same, copied, chances, strict=True):

@@ -23,15 +23,13 @@ def as_gray(
     measured: "Measured",
     colour: Colour,
 ) -> tuple[xr.Dataset, Array, tuple["Measured", Any]]:
-    """Scale a capture to one of a gray background: with the scales s, and what it is found to be.
-
-    Its emissivities, from which s follows, are at first those of the signals as they are.
-    """
+    """Scale a capture to a gray background; return it, the scales s, and the separation with it."""
     inputs, level, scale = measured.inputs, colour.level, colour.scale(measured.result)
     if level is None:
         films = measured.result["background_temperature"].values
         films = films[:, measured.result["status"].values == 0]
         level = float(np.nanmedian(films)) if films.size else inputs.curves[0].reference
+    # The emissivities, from which s follows, are at first those of the signals as they are.
     for _ in range(_ROUNDS):
         counts = empty(corrected["counts"].shape, np.float32)
         for band, curve in enumerate(inputs.curves):

@@ -335,16 +335,14 @@ def _begin(folder: Path, plan: Mapping[str, Any]) -> None:
 def _content(
     source: Path | xr.Dataset, capture: xr.Dataset, read: tuple[int, int], executor: Executor
 ) -> Any:
-    """Checksums of a capture's store; without these, digests of its values, read by the workers.
-
-    By rows, or by so many columns of a row that does not fit in the memory.
-    """
+    """Checksums of a capture's store, or digests of its values, which the workers read."""
     if isinstance(source, Path) and (sums := last_sums(source)):
         return sums
     films = [name for name, variable in capture.variables.items() if "y" in variable.dims]
     constant, every = capture.drop_vars(films), capture.drop_vars(capture.variables.keys() - films)
     rows, width = read
     heights = capture["counts"].chunksizes.get("y") or [rows] * math.ceil(capture.sizes["y"] / rows)
+    # By rows, or by so many columns of a row that does not fit in the memory.
     blocks = [
         every.isel(y=slice(end - height, end), x=slice(start, start + width))
         for end, height in zip(accumulate(heights), heights, strict=True)

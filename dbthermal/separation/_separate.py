@@ -54,9 +54,9 @@ _NOT_COMPLETED: Final = (
     f"completed, the bands must have names of {[*FILTERS]} when the capture is made, or a prior on "
     "their emissivities."
 )
-_MANY: Final = 0.3  # share of them from which a shift does not explain it
-# Share of them from which the clocks are compared: of scenes with one clock at most 0.003, beside
-# reflections at several depths; and what one clock must leave of it.
+_MANY: Final = 0.3  # share of asynchronous pixels from which a shift does not explain them
+# Share of asynchronous pixels from which the clocks are compared: of scenes with one clock at most
+# 0.003, beside reflections at several depths; and the part of it that one clock may leave.
 _SOME, _LESS = 0.05, 0.5
 
 
@@ -191,12 +191,9 @@ def separate(  # noqa: PLR0913 - all but the first two by name
 def _on_one_clock(
     capture: xr.Dataset, once: Callable[..., tuple["Measured", Misfit]]
 ) -> tuple[xr.Dataset, tuple["Measured", Misfit], list[str], Array | float]:
-    """Separate; again on one clock, if the bands show the same at different times.
-
-    Returns the capture on one clock, what was measured and what is left, what was done, and by how
-    much the object (y, x) [K] hangs on which of the clocks that is.
-    """
+    """Separate, and again on one clock if the bands show the same at different times."""
     outcome = once(capture)
+    # Capture, outcome, sentences, and deviation (y, x) [K] of the object by the choice of clock.
     unchanged = capture, outcome, list[str](), 0.0
     names, share = capture["band"].values.tolist(), outcome[0].asynchronous
     if share <= _SOME:
@@ -238,10 +235,7 @@ def _lacking(aligned: xr.Dataset) -> bool:
 def _mended(
     original: xr.Dataset, once: Callable[..., tuple["Measured", Misfit]]
 ) -> tuple[xr.Dataset, tuple["Measured", Misfit], list[str]]:
-    """Separate; again, while what is left shows that clocks or blurs differ, or cameras move.
-
-    Returns the capture as mended, what was measured and what is left, and what was done.
-    """
+    """Separate, and again while what is left shows that clocks or blurs differ, or cameras move."""
     original, (measured, misfit), late, remainder = _on_one_clock(original, once)
     capture, motion, sentences = original, None, list[str]()
     for _ in range(_ROUNDS):
@@ -264,7 +258,7 @@ def _mended(
     retry = None if alike is None else once(alike.capture, measured.reflection_shift)
     if alike and retry and retry[0].sound > _KEPT * measured.sound:
         measured, less = retry
-        # Noise that is not white is told before: a blur takes rapid noise alone.
+        # Noise that is not white is estimated before the blur, which lessens rapid noise alone.
         detail = np.hypot(remainder, alike.detail)
         less = replace(less, change=np.hypot(less.change, detail), single=misfit.single)
         capture, outcome = alike.capture, (measured, less)

@@ -184,14 +184,11 @@ def separated(
     workers: int = 2,
     progress: bool = False,
 ) -> tuple[xr.Dataset, Survey | None]:
-    """Separate checked inputs; and the surveys per pixel, of cameras at one place.
-
-    To pool pixels before displaced cameras, the result per pixel (`alone`) is needed; made if not
-    passed. The materials may be regrouped by their ratios (`regroup`).
-    """
+    """Separate checked inputs; return result, and surveys per pixel of cameras at one place."""
     # Make the result, whose values are written tile by tile.
     capture, names = inputs.capture, [*schema.STAGES["separated"]]
     displaced, pooled = inputs.displacement is not None, inputs.labels is not None
+    # Pooling of pixels before displaced cameras needs the result per pixel (`alone`).
     if alone is None and displaced and pooled:
         alone, _ = separated(replace(inputs, labels=None), workers=workers, progress=progress)
     names += [_COVARIANCE, "drift_std"] if inputs.method.pools else []
@@ -212,7 +209,7 @@ def separated(
             separate = partial(_separate, inputs, material, into, survey, wanted)
             for pixels in threads.map(separate, inputs.blocks):
                 bar.update(pixels)
-            # Few pixels in pieces may be so by a flaw, as a delay: these are searched anew.
+            # Few pixels in pieces may be caused by a flaw, as a delay: they are searched anew.
             if np.mean(inputs.division.any(axis=0)) < _DIVIDED:
                 inputs.division[:] = 0
             return survey
@@ -222,7 +219,7 @@ def separated(
             side_by_side.pooled(inputs, alone, result, separate_pixels, threads, materials, regroup)
         elif displaced:
             side_by_side.alone(inputs, result, separate_pixels, threads)
-        elif pooled:
+        elif pooled:  # materials may be regrouped by their ratios
             separate_pixels(*pooling.regrouped(inputs, materials, regroup))
         else:
             surveys = separate_pixels(inputs, None)
@@ -315,7 +312,7 @@ def _separate(
                 estimate = estimate.select_pixels(pixels)
             estimates.append((frames, pixels, estimate))
             if estimate.survey is not None:
-                # Whitened by one noise for all, not by that of the pixel.
+                # Whitened by the noise common to all pixels, not by the noise of this pixel.
                 scale = tile.scaled(tile.noise) / inputs.noise[inputs.bands][:, np.newaxis]
                 scatter = estimate.survey.scatter * (scale[:, np.newaxis] * scale)
                 section = replace(estimate.survey, scatter=scatter)
@@ -361,12 +358,11 @@ def _write(
     cut: tiles.Cut,
     estimates: list[tuple[Mask, Mask, Estimate]],
 ) -> None:
-    """Write the estimates of a window into the result, at frames (time) and pixels (pixel).
-
-    The tile's bands have these places in the capture. What has no estimate becomes NaN.
-    """
+    """Write the estimates of a window into the result, at frames (time) and pixels (pixel)."""
+    # The tile's bands have the places `bands` in the capture.
     order, shape = np.argsort(bands), tuple(span.stop - span.start for span in cut.window)
     unestimated, complete = np.ones(cut.status.size, dtype=bool), bool(np.all(cut.valid))
+    # What has no estimate becomes NaN.
     for _, pixels, _ in estimates:
         unestimated &= ~pixels
     for name in map(str, result.data_vars):
@@ -400,10 +396,7 @@ def _scatter(
     valid: Mask,
     film: Any,
 ) -> None:
-    """Write values (time, pixel) of some frames and pixels into a film (time, y, x), in place.
-
-    NaN at its other frames, and at samples (time, pixel) that are not valid.
-    """
+    """Write values (time, pixel) into a film (time, y, x), NaN at invalid frames and samples."""
     row, (y, x) = 0, places
     for t in range(frames.size):
         for p in range(pixels.size):

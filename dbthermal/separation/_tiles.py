@@ -213,11 +213,7 @@ class Estimate(Pixels):
             self.survey.frames[order, selected] = np.where(sound, frames, 0.0)
 
     def check_range(self, curve: Curve, *, not_estimated: Collection[str] = ()) -> "Estimate":
-        """Flag temperatures outside the calibrated range of a response, and missing values.
-
-        Samples without a useful standard deviation become NaN. No bit is set for variables that are
-        `not_estimated`, or NaN in all samples of a pixel with another bit.
-        """
+        """Flag temperatures outside the calibrated range of a response, and missing values."""
         values: dict[str, Any] = {}
         beyond = np.zeros(self.status.shape, dtype=bool)
         for name in ("object_temperature", "background_temperature", *_MAPS):
@@ -225,6 +221,8 @@ class Estimate(Pixels):
             if value is None or name in not_estimated:
                 continue
             precise = (std < USELESS) | (f"{name}_std" in not_estimated)
+            # Samples without a useful deviation become NaN; a pixel that is NaN in all samples by
+            # another bit gets no further bit.
             lost = ~((np.abs(value) < USELESS) & precise)
             explained = np.all(np.isnan(value), axis=0) & (self.status != 0)
             beyond |= np.any(lost, axis=0) & ~explained
@@ -272,10 +270,7 @@ def largest(method: Method, settings: Any, capture: xr.Dataset) -> int:
 def cut(
     inputs: Inputs, rows: slice, material: Material | None = None, wanted: Mask | None = None
 ) -> Iterator[Cut]:
-    """Read rows and cut them into tiles, with the material of each pixel of the image.
-
-    Of all pixels, or of those of the image that are `wanted` (pixel).
-    """
+    """Read rows, and cut all pixels, or those `wanted` in the image (pixel), into tiles."""
     displacement, method = inputs.displacement, inputs.method
     sampled = _sampler(inputs, rows)
     width, frames = inputs.capture.sizes["x"], inputs.capture.sizes["time"]
@@ -343,13 +338,11 @@ def _numbers(window: Window, width: int) -> Whole:
 
 
 def read(inputs: Inputs, rows: slice) -> tuple[Array, Mask, Mask, Array]:
-    """Signals (band, frame, pixel) [K] of some rows, the quietest band first.
-
-    In the frames that most pixels have; and these (time), the pixels that have them all, and the
-    noise (band, pixel) over that of a sample.
-    """
+    """Signals (band, frame, pixel) [K] of some rows; frames (time), pixels, noise (band, pixel)."""
     window = rows, slice(0, inputs.capture.sizes["x"])
     counts, usable, _, status, gain = _sampler(inputs, rows)(window, slice(None))
+    # Frames that most pixels have, pixels with all of these; bands from the quietest, noise over
+    # that of a sample [1].
     sets = quality.common_frames(counts, usable, status, inputs.method.minimum_frames)
     frames, pixels = sets[0] if sets else (np.ones(len(usable), dtype=bool), status < 0)
     signals = _tile(inputs, counts, window, slice(None)).signals
@@ -421,10 +414,7 @@ def _tile(inputs: Inputs, counts: Array, window: Window, selected: slice | Whole
 def of_one_noise(
     frames: Mask, pixels: Mask, tile: Tile, gain: Array, most: int
 ) -> Iterator[Section]:
-    """Yield parts of a tile, of at most so many pixels whose resampled bands have one noise.
-
-    A residual pattern is independent from pixel to pixel, and is scaled like the noise.
-    """
+    """Yield parts of a tile, of at most so many pixels whose resampled bands have one noise."""
     order = np.rint(np.log(gain[pixels]) / _NOISE_STEP).astype(np.intp)
     for level in np.unique(order):
         alike = np.flatnonzero(order == level)
@@ -433,6 +423,7 @@ def of_one_noise(
             group = np.zeros_like(pixels)
             group[np.flatnonzero(pixels)[chosen]] = True
             factors = np.append(1.0, [np.exp(np.log(gain[group]).mean())] * (len(tile.noise) - 1))
+            # A residual pattern is independent from pixel to pixel, and is scaled like the noise.
             noise, pattern = (tuple(factors * stds) for stds in (tile.noise, tile.pattern))
             single = replace(tile.select_pixels(chosen), noise=noise, pattern=pattern)
             yield frames, group, single

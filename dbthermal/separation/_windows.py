@@ -32,10 +32,7 @@ def intersect(low: float, high: float, value: float, variance: float) -> tuple[f
 
 
 def smooth(values: Array, variance: Array, valid: Mask, time: Array) -> tuple[Array, Array]:
-    """Smooth curves (time, pixel) of white noise of a variance (time, pixel), at valid samples.
-
-    Returns the curves and the variances that are left.
-    """
+    """Smoothed curves (time, pixel), with white noise of a variance (time, pixel); variances."""
     position = (time - time[0]) / max(time[-1] - time[0], 1e-300)
     rows = [np.ascontiguousarray(array.T) for array in (values, variance, valid)]
     halves = [1]
@@ -60,7 +57,7 @@ def _smooth(
     frames, pad = position.size, halves[-1] if halves.size else 0
     sums = np.zeros((3, frames + 1 + 2 * pad))
     windows = np.empty((halves.size, 4, frames))
-    # Arrays by themselves: of parts of one the compiler takes no vectors.
+    # Separate arrays: the compiler does not vectorise parts of a common array.
     bounds = lower, upper, agreeing = np.empty(frames), np.empty(frames), np.empty(frames)
     estimate, unbounded = np.empty(frames), np.full(frames, np.inf)
     widest = np.empty(frames, np.intp)
@@ -110,15 +107,13 @@ def _widen(
     left: Array,
     widest: Whole,
 ) -> bool:
-    """Intersect confidence intervals (time), in place; take the window before where they agree.
-
-    A window is taken if it has less noise. Returns whether the intervals of a frame still overlap.
-    """
+    """Intersect confidence intervals (time), in place; return whether any still overlap."""
     (wide, share), (lower, upper, agreeing), remaining = shares, bounds, 0.0
     for t in range(estimate.size):
         lower[t], upper[t] = intersect(lower[t], upper[t], estimate[t], wide[t] * noise)
         agreeing[t] = agreeing[t] if lower[t] <= upper[t] else 0.0
         remaining += agreeing[t]
+        # Where they agree take the window before, if it has less noise.
         better = (agreeing[t] > 0.0) & (share[t] * noise <= left[t])
         widest[t] = window if better else widest[t]
         left[t] = share[t] * noise if better else left[t]
@@ -129,16 +124,13 @@ def _widen(
 def _sum_up(
     values: Array, variance: Array, valid: Mask, position: Array, sums: Array, pad: int
 ) -> tuple[float, float]:
-    """Means of the valid values and variances of a pixel (time); what is summed up, in place.
-
-    Of the samples before each place (3, time + 1), with a pad at both ends: values about the mean,
-    times powers of their positions.
-    """
+    """Means of a pixel's valid values and variances (time); sums (3, time + 1) in place, padded."""
     count, level, noise = 0.0, 0.0, 0.0
     for t in range(position.size):
         if valid[t]:
             count, level, noise = count + 1.0, level + values[t], noise + variance[t]
     level, noise = level / max(count, 1.0), noise / max(count, 1.0)
+    # Sums before each place, of values about the mean times powers of their positions.
     for t in range(position.size):
         value = values[t] - level if valid[t] else 0.0
         for power in range(3):
@@ -151,11 +143,7 @@ def _sum_up(
 
 @compiled
 def _lay_windows(valid: Mask, position: Array, halves: Whole, windows: Array) -> None:
-    """Weights of parabolas, or lines, at the centres of windows (half-width, 4, time), in place.
-
-    Of the sums of values times powers of their positions, and the variance over the noise's; zero
-    and infinite where the samples do not determine them.
-    """
+    """Weights of parabolas, or lines, at the centres of windows (half-width, 4, time), in place."""
     sums = np.zeros((position.size + 1, 5))
     for t in range(position.size):
         weight = 1.0 if valid[t] else 0.0
@@ -169,7 +157,7 @@ def _lay_windows(valid: Mask, position: Array, halves: Whole, windows: Array) ->
 
 @compiled
 def _centre(sums: Array, position: Array, place: int, half: int, window: Array) -> None:
-    """Weights of one window, in place."""
+    """Weights of one window's sums of `_sum_up`, and its variance over the noise's, in place."""
     low, high = max(place - half, 0), min(place + half + 1, position.size)
     width = position[min(high, position.size - 1)] - position[low]
     scale, at = 1.0 / max(width, 1e-300), position[place]
@@ -188,6 +176,7 @@ def _centre(sums: Array, position: Array, place: int, half: int, window: Array) 
         # First row of the inverse of ((s0 s1 s2) (s1 s2 s3) (s2 s3 s4)).
         c0, c1, c2 = s2 * s4 - s3**2, s2 * s3 - s1 * s4, s1 * s3 - s2**2
         determinant, least = a0 * c0 + s1 * c1 + s2 * c2, 1e-8 * a0**3
+    # Samples that do not determine the polynomial: no weight, and no certainty.
     if not determinant > least:
         window[:3], window[3] = 0.0, np.inf
         return
