@@ -66,8 +66,8 @@ _HALF: Final = 4.0
 _DISTURBED: Final = Status.OBJECT_NOT_SMOOTH | Status.OBJECT_JUMP | Status.BANDS_APART
 _MANY: Final = 0.1
 # Of slow motion: polynomials of the time, windows along a side of the image, and frames at most. As
-# the slower weigh more, a drift of one pixel shows a square of 30 to 138 in six scenes, and 108 of
-# 18 other situations at most 11; 30 of 24x32 pixels up to 93, but of less than 0.06 pixel.
+# the slower weigh more, a drift of one pixel shows a square of 30 to 138 in six scenes; 108 scenes
+# without, of 18 situations, at most 11; 30 of 24x32 pixels up to 93, but of less than 0.06 pixel.
 _DEGREES, _WINDOWS, _FRAMES = 6, 4, 128
 
 
