@@ -396,5 +396,5 @@ def bent(
     before, after = forces @ np.column_stack([np.ones(_GROUPS), 1.0 - np.eye(_GROUPS)])
     share, *without = before / (before - after)
     if np.sqrt((_GROUPS - 1) * np.var(without)) <= _VAGUE and 0.0 <= share <= _MOST_BENT:
-        return replace(plan, bend=share * plan.bend, swing=np.inf)
+        return replace(plan, bend=share * plan.bend)
     return plan

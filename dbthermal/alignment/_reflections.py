@@ -170,7 +170,7 @@ def _coarse(
             # A field of slower changes must fit the data of the more robust field before it, unless
             # that field's deviation is a pixel or more: an unknown field vetoes no shift.
             distance = begin.disagreement(before, level.centres(), field)
-            distance *= np.mean(sizes[earlier]) < 0.0
+            distance = distance if np.mean(sizes[earlier]) < 0.0 else 0.0
         if resolved.any() and gain > np.log(_MORE) and distance < _AGREE:
             before, earlier, sizes = data, resolved, size
             result = (replace(capture, valid=valid), tried, period, field)

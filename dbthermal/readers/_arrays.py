@@ -119,7 +119,7 @@ def _checked(values: Any, label: str, unit: str) -> dict[str, Any]:
     name = "" if hasattr(values, "stream") else str(getattr(values, "name", ""))  # not of a file
     titles = f"{name.rpartition('/')[2]} {texts['long_name']} {texts['standard_name']}"
     if named := re.search("temperature|celsius|kelvin", titles, re.IGNORECASE):
-        rule = "Must be counts: rename the array if it is of counts"
+        rule = "Must be counts: if it is, rename the array or its long_name"
         raise ValueError(f"Invalid array of '{label}', named '{named.group()}'. {rule}.")
     text = str(attributes.get("units", attributes.get("unit", unit))).strip()
     _recording.check_unit(unit if text in {"", "1"} else text, label)

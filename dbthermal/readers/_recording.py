@@ -178,7 +178,7 @@ def array_name(names: Collection[str], name: str | None, path: Path, shapes: Seq
     """Name of an array in a file, which may be left out if there is one alone."""
     if name is None and len(names) == 1:
         return next(iter(names))
-    for candidate in (str(name), str(name).strip("/")):
+    for candidate in () if name is None else (str(name), str(name).strip("/")):
         if candidate in names:
             return candidate
     if not names:

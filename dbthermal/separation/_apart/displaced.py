@@ -37,6 +37,7 @@ _LOST_WEIGHT: Final = 0.25  # weight of pixels without a value that good pixels 
 # Share of the pixels of some rows up to which pixels are read singly: a shift that is as wide as
 # an image is high leaves most of them without a weight [1].
 _FEW: Final = 0.5
+_ROWS: Final = 2**14  # rows of weights that are changed at once
 _NO_WEIGHT: Final = 1e-3  # weight below which a pixel's flags do not count [1]
 # Memory of resampled samples that are kept, for a capture is read some nine times [byte].
 _KEPT: Final = 2**29
@@ -193,7 +194,7 @@ def paired(
     fewest: int,
 ) -> Paired:
     """Read some pixels of some rows as `read` does, their short gaps bridged."""
-    # Samples of the second camera are kept, in single precision: a source is not read again.
+    # Samples of the second camera are kept, in single precision: they are not resampled again.
     kept, place, bands = displacement.kept, (rows.start, rows.stop), capture.sizes["band"]
     resampled = kept.get(place)
     if resampled is None:
@@ -204,21 +205,21 @@ def paired(
         resampled = Resampled(second, packed, status, gain)
         if sum(film.counts.nbytes for film in (resampled, *kept.values())) <= _KEPT:
             kept[place] = resampled
-    status, gain = resampled.status[selected].copy(), resampled.gain[:, selected]
+    # Gaps are bridged in frames that most pixels of the rows have: then all pixels are read.
+    pixels = selected if resampled.packed is None else slice(None)
     first = capture["counts"].isel(band=displacement.reference, y=rows).values
-    first = first.reshape(len(first), -1)[:, selected]
-    valid = np.ones(first.shape, dtype=bool)
+    first, second = first.reshape(len(first), -1)[:, pixels], resampled.counts[..., pixels]
+    valid, lost = np.ones(first.shape, dtype=bool), quality.unusable(resampled.status[pixels])
     if resampled.packed is not None:
-        valid = np.unpackbits(resampled.packed[:, selected], axis=0, count=len(first)).view(bool)
+        valid = np.unpackbits(resampled.packed, axis=0, count=len(first)).view(bool)
     counts = np.empty((bands, *first.shape))
-    counts[displacement.reference], counts[displacement.others] = (
-        first,
-        resampled.counts[..., selected],
-    )
-    lost = quality.unusable(status)
+    counts[displacement.reference], counts[displacement.others] = first, second
     if lost.any() or resampled.packed is not None:
         counts[:, ~valid | lost] = 0.0
     counts, usable = quality.bridge(counts, valid, capture["time"].values.astype(np.float64))
+    if resampled.packed is not None:
+        counts, usable, valid = counts[..., selected], usable[:, selected], valid[:, selected]
+    status, gain = resampled.status[selected].copy(), resampled.gain[:, selected]
     return counts, usable, valid, status, gain
 
 
@@ -291,21 +292,21 @@ def without(weights: csr_array, bad: Mask, width: int) -> csr_array:
     rows = np.flatnonzero((lost > 0) & (lost <= _LOST_WEIGHT))
     if rows.size == 0:
         return weights
-    # The entries of these rows, side by side.
-    start, count = weights.indptr[rows, np.newaxis], np.diff(weights.indptr)[rows, np.newaxis]
-    place = np.arange(count.max())
-    entries = start + np.where(place < count, place, 0)
-    pixels, values = weights.indices[entries], np.where(place < count, weights.data[entries], 0.0)
-    # A plane about their middle.
-    plane = np.stack([np.ones(pixels.shape), *np.divmod(pixels, width)])
-    size = np.abs(values)
-    plane[1:] -= ((plane[1:] * size).sum(axis=-1) / size.sum(axis=-1))[..., np.newaxis]
-    # The smallest change of the good pixels' weights with the same sums over the plane.
-    off = bad[pixels]
-    kept, missing = np.where(off | (place >= count), 0.0, plane), np.where(off, plane * values, 0.0)
-    change = np.linalg.pinv(np.moveaxis(kept, 0, 1)) @ missing.sum(axis=-1).T[..., np.newaxis]
     weights = weights.copy()
-    weights.data[entries[place < count]] = np.where(off, 0.0, values + change[..., 0])[
-        place < count
-    ]
+    for group in np.array_split(rows, -(-rows.size // _ROWS)):
+        # The entries of these rows, side by side.
+        start, count = weights.indptr[group, np.newaxis], np.diff(weights.indptr)[group, np.newaxis]
+        place = np.arange(count.max())
+        held = place < count
+        entries = start + np.where(held, place, 0)
+        pixels, values = weights.indices[entries], weights.data[entries] * held
+        off = bad[pixels]
+        # A plane about their middle.
+        plane, size = np.stack([np.ones(pixels.shape), *np.divmod(pixels, width)]), np.abs(values)
+        plane[1:] -= ((plane[1:] * size).sum(axis=-1) / size.sum(axis=-1))[..., np.newaxis]
+        # The smallest change of the good pixels' weights with the same sums over the plane.
+        good, missing = plane * (held & ~off), (plane * (values * off)).sum(axis=-1)
+        change = np.linalg.pinv(np.moveaxis(good, 0, 1)) @ missing.T[..., np.newaxis]
+        values = np.where(off, 0.0, values + change[..., 0])
+        weights.data[entries[held]] = values[held]
     return weights
