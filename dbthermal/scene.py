@@ -87,7 +87,6 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     UserWarning
         As the steps.
 
-
     Examples
     --------
     A plate of glass, simulated, from raw counts; both cameras look through one window:

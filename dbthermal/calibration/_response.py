@@ -27,10 +27,8 @@ TEMPERATURE_STD: Final = 0.1  # of an area blackbody about its reading [K]
 NO_BARS: Final = "maker's constants, without error bars"
 """Attribute ``calibration`` of a response, and of what is made with it."""
 
-# Range of the curve's mean wavelength A + B / T: the band's edges, wider by a factor because a
-# detector is no top hat; the thermal infrared for an unknown band.
-_WAVELENGTH_MARGIN: Final = 1.2
-_THERMAL: Final = bands.Band("thermal infrared", 2e-6, 20e-6)
+_WAVELENGTH_MARGIN: Final = 1.2  # on a band's edges, for A + B / T: a detector is no top hat
+_THERMAL: Final = bands.Band("thermal infrared", 2e-6, 20e-6)  # range of A + B / T, band unknown
 # Range of A T / (A T + B): 1 at one wavelength, 0.94 in 8-14 um, 0.65 in 3-14 um; above 1 only by
 # the nonlinearity of a detector.
 _GROWTH: Final = (0.6, 1.1)

@@ -34,7 +34,7 @@ def quantised(values: Values, low: float, high: float) -> npt.NDArray[np.uint8]:
 
 
 def extremes(values: Values, measured: Mask) -> list[tuple[int, int, float]]:
-    """Row, column and value of the coldest and the hottest measured pixel; none without one."""
+    """Row, column and value of the coldest and the hottest measured pixel, if any is measured."""
     valid = np.where(measured & np.isfinite(values), values, np.nan)
     if not np.isfinite(valid).any():
         return []
@@ -161,7 +161,7 @@ class Explorer(anywidget.AnyWidget):
         return {**answer, "ranges": [*ranges.values()]}, [*codes, *sides]
 
     def _frame(self, name: str, request: dict[str, Any]) -> Values:
-        """Frame of a pane, of a film less that of reference if there is one."""
+        """Frame of a pane; of a film its difference from the reference frame, if stated."""
         frame, less = self.view.frame(name, request["index"]), request.get("reference")
         if less is None or self.view.panes[name].kind != "film":
             return frame

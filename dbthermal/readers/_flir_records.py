@@ -40,11 +40,7 @@ Frame = Mapping[int, Record]  # record by its type
 
 
 def frames(content: Content, name: str, *, still: bool) -> Iterator[Frame]:
-    """Yield the records of each frame of a file; ValueError by frame and byte where damaged.
-
-    Behind the last record lie zeros, or bytes that fill up to a multiple of 4. A still has one
-    frame: what follows without a mark fills it up.
-    """
+    """Yield the records of each frame of a file; ValueError by frame and byte where damaged."""
     at: int | None = 0
     number = 0
     while at is not None:
@@ -55,6 +51,7 @@ def frames(content: Content, name: str, *, still: bool) -> Iterator[Frame]:
 
 def _following(content: Content, start: int, stop: int, *, still: bool) -> int | None:
     """Place of the frame behind one that lies from start to stop; None at the end of the file."""
+    # Behind the last record lie zeros, or bytes that fill the frame up to a multiple of 4.
     filled = start + -(-(stop - start) // _ALIGNED) * _ALIGNED
     for behind in (stop, filled):
         if (byte := _NO_ZERO.search(content, behind)) is None:
@@ -62,7 +59,7 @@ def _following(content: Content, start: int, stop: int, *, still: bool) -> int |
         at, head = byte.start(), content[byte.start() : byte.start() + _HEADER]
         if any(mark.startswith(head[: len(mark)]) for mark in _MARKS):
             return at
-    return None if still or len(head) < _HEADER else at
+    return None if still or len(head) < _HEADER else at  # a still has one frame, then filling
 
 
 def body(content: Content, record: Record) -> tuple[bytes, str]:

@@ -101,7 +101,7 @@ def _other_height(counts: Counts) -> list[str]:
     height, rows = counts.shape[1], np.concatenate(counts[: 2 * _FIRST]).astype(np.int32)
 
     def change(distance: int) -> float:
-        """Usual change from a row to that so far below."""
+        """Median change from a row to the row at a distance below."""
         return float(np.median(np.abs(rows[distance:] - rows[:-distance])) + 0.5)
 
     tried = [height // n for n in (4, 3, 2) if height % n == 0] + [n * height for n in range(1, 5)]
@@ -114,7 +114,7 @@ def _other_height(counts: Counts) -> list[str]:
 
 
 def _are_longer(counts: Counts) -> bool:
-    """Tell whether numbers are parts of longer ones: neighbours, or every fourth, are rougher."""
+    """Tell whether numbers are parts of longer numbers: neighbours or some fourths are rougher."""
     values = counts[0].ravel().astype(np.int32)
     if values.size < _FIRST * 4:
         return False

@@ -17,8 +17,8 @@ from dbthermal._warnings import warned
 from dbthermal.readers._recording import FileFlag
 
 _SCENE: Final = (5.0, 100.0)  # temperatures of a scene [degC]
-_FRAMES: Final = 16  # about as many of them tell
-_ALIKE: Final = 5.0  # between the medians of two bands [K]
+_FRAMES: Final = 16  # about as many frames are sampled
+_ALIKE: Final = 5.0  # largest difference of the medians of two bands [K]
 
 
 def two_bands(
@@ -89,7 +89,7 @@ def two_bands(
         later, spans = (" and ".join(f"{it:g}" for it in each) for each in (shifts[1:], stops))
         label = f"Invalid offset {later} s: the recordings of {spans} s do not overlap"
         raise ValueError(f"{label}. Must overlap; give offset= if a camera's clock is wrong.")
-    # As many cameras, not a file named twice.
+    # No two recordings may have the same counts, as of a file that is named twice.
     overlapping = [recording["counts"].values[: min(lengths)] for recording in cameras]
     for film, other_film in combinations(overlapping, 2):
         if all(np.array_equal(film[at], other_film[at]) for at in parts(film)):
@@ -143,7 +143,7 @@ def _offsets(cameras: Sequence[xr.Dataset], offset: Any) -> list[float]:
 
 
 def _names(bands: Any, number: int) -> list[str]:
-    """Names of so many bands, which must be texts, and differ."""
+    """Names of the bands, which must be different texts, as many as stated."""
     listed = bands if isinstance(bands, Sequence) and not isinstance(bands, str) else []
     names = [str(name) for name in listed if isinstance(name, str) and name.strip()]
     if not len({*names}) == len(listed) == number:
