@@ -191,7 +191,7 @@ class Accuracy:
     blackbody: float  # [K]
     reflected: float  # by the blackbody, of the room [1]
     room: float  # [K]
-    colour: float  # of what is mirrored, its changes in a band over those in the first, less 1 [1]
+    colour: float  # std of a reflection's changes in a band over its changes in the first [1]
     centre: float  # of the calibrated range [K]
 
     def reading(self, band: int, temperature: npt.ArrayLike) -> Array:
@@ -205,7 +205,7 @@ class Accuracy:
 def accuracy(
     response: xr.Dataset, bands: list[str], reference: Mapping[str, Any] | None = None
 ) -> Accuracy:
-    """Accuracy of some bands of a response, by default `ACCURACY`; ValueError outside its limits."""
+    """Accuracy of some bands of a response, by default `ACCURACY`; ValueError outside limits."""
     places, stated = schema.band_positions(response, bands, "the response"), dict[str, Array]()
     limits = {"blackbody_emissivity": (1e-3, 1.0), "room_temperature": _numbers.KELVIN}
     limits |= {"gain_std": (0.0, 1.0), "background_ratio_std": (0.0, 1.0)}  # relative, not in %
@@ -274,7 +274,7 @@ def curves(response: xr.Dataset, bands: Sequence[str], kind: str = "exact") -> l
 
 
 def _curve(number: dict[str, float], band: str, kind: str) -> Curve:
-    """Curve of one band, of the numbers of its response."""
+    """Curve of one band, from the coefficients of its response."""
     # Refuse coefficients and a range that are no response.
     if bad := [name for name, value in number.items() if not np.isfinite(value)]:
         raise ValueError(f"Invalid {bad[0]} of the response in band '{band}'. Must be finite.")

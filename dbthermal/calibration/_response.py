@@ -193,7 +193,7 @@ def fit_response(  # noqa: PLR0913 - what is known of blackbody and cameras, by 
 
 
 def _exchanged(netd: Mapping[str, float]) -> list[str]:
-    """Sentences on bands that are much quieter than one that contains them."""
+    """Sentences on bands that are much quieter than a wider band that contains them."""
     filters = [name for name in netd if name in bands.FILTERS]
     return [
         f"Noise of {netd[inner]:.3g} K in band '{inner}', of {netd[outer]:.3g} K in '{outer}', "
@@ -342,7 +342,7 @@ def _check_residuals(curve: Curve, temperature: Array, counts: Array, std: float
     if np.sum(off**2) <= std**2 * chdtri(counts.size - 2, _FALSE_ALARM):
         return
     explained = f"noise and blackbody explain {std:.3g} count"
-    # Readings without which the others lie on a curve.
+    # Readings without which the remaining readings lie on a curve.
     fitting = []
     for place in range(counts.size):
         remaining = np.arange(counts.size) != place
@@ -376,7 +376,7 @@ def _wavelengths(band: str) -> tuple[float, float]:
 
 
 def fit_band(band: str, temperature: Array, counts: Array) -> Curve:
-    """Curve of least squares of one band."""
+    """Least-squares curve of one band."""
     middle = 0.5 * (temperature[0] + temperature[-1])
     span = counts[-1] - counts[0]
 

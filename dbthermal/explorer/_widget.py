@@ -27,7 +27,7 @@ _REFUSED: Final = (ArithmeticError, LookupError, MemoryError, OSError, TypeError
 
 
 def quantised(values: Values, low: float, high: float) -> npt.NDArray[np.uint8]:
-    """Places in a palette: 1 to 255 from the low end of a range to the high one, 0 without one."""
+    """Places in a palette: 1 to 255 from the low to the high end of a range, 0 without a value."""
     with np.errstate(invalid="ignore", over="ignore"):
         codes = (values - np.float32(low)) * np.float32(255.0 / (high - low)) + np.float32(1.0)
     return np.where(schema.measured(values), np.clip(codes, 1.0, 255.0), 0.0).astype(np.uint8)
@@ -88,7 +88,7 @@ class Explorer(anywidget.AnyWidget):
         return base64.b64encode(buffer.getvalue()).decode()
 
     def _range(self, name: str) -> tuple[float, float]:
-        """Range of colour of a pane, once found."""
+        """Range of colour of a pane, computed once."""
         if name not in self._limits:
             self._limits[name] = self.view.limits(name)
         return self._limits[name]

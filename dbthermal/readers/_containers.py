@@ -40,7 +40,7 @@ _NO_VARIABLE: Final = "This is a netCDF dimension but not a netCDF variable"
 
 
 def dims_of(values: Any) -> list[Any]:
-    """Dims of an array of zarr (2 or 3), h5py, netCDF4 or xarray; empty of one that has none."""
+    """Dims of an array of zarr (2 or 3), h5py, netCDF4 or xarray; empty without names."""
     if isinstance(values, zarr.Array):
         stored: Any = values.attrs.get("_ARRAY_DIMENSIONS", ())
         return [*(getattr(values.metadata, "dimension_names", None) or stored)]
@@ -70,7 +70,7 @@ def attribute(values: Any, name: str) -> Any:
 
 
 def moments(times: Any) -> npt.NDArray[Any] | None:
-    """Times as numbers or dates, those in text as seconds; None of other text."""
+    """Times as numbers or dates, dates in text as seconds; None for other text."""
     if times.dtype.kind in "iufmM":
         return np.asarray(times[...]).reshape(-1)
     seconds = list[float]()
@@ -154,7 +154,7 @@ def _hdf5(path: Path, stack: ExitStack) -> dict[str, Any]:
 
 
 def _filters(array: Any, path: Path) -> list[int]:
-    """Codes of the filters of an array of HDF5, of which one packs, behind those that shuffle."""
+    """Codes of the filters of an HDF5 array: shuffles, then at most one filter that packs."""
     h5py, form = _recording.optional("h5py", "recordings"), array.id.get_create_plist()
     filters = [form.get_filter(n) for n in range(form.get_nfilters())]
     codes = [code for code, *_ in filters]
@@ -177,7 +177,7 @@ def check_whole(array: Any, path: Path) -> None:
     """Refuse an array that is not all there, or whose chunks unpack to more than itself."""
     if isinstance(array, zarr.Array):
         _check_chunks(array, path)
-    elif hasattr(array, "is_virtual"):  # of HDF5; one of NetCDF 3 is whole by its header
+    elif hasattr(array, "is_virtual"):  # of HDF5; an array of NetCDF 3 is whole by its header
         _check_pieces(array, path)
 
 

@@ -275,7 +275,7 @@ def _cameras(listed: Sequence[_Found], *, timed: bool) -> tuple[Array, Mask, dic
         whole, thousandths = struct.unpack_from(f"{order}II", body, _TIME)
         if whole:
             milliseconds[number] = whole * 1000 + (thousandths & 0xFFFF)
-        # Settings and constants, which must stay those of the first frame.
+        # Settings and constants, which must not change after the first frame.
         camera = {
             key: struct.unpack_from(order + code, body, start)[0]
             for key, (start, code, *_) in _FIELDS.items()
@@ -310,7 +310,7 @@ def _numbers_agree(numbers: npt.NDArray[np.int64]) -> Mask:
 
 
 def _attrs(camera: dict[str, Any], seconds: float | None = None) -> dict[str, Any]:
-    """Attributes of a camera's record: its values as written, and those that cannot be meant."""
+    """Attributes of a camera's record: its values as written, and the implausible values."""
     body, attrs, implausible = camera.pop("body"), dict[str, Any](), list[str]()
     for key, value in camera.items():
         _, code, low, high = _FIELDS[key]

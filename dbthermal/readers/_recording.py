@@ -92,7 +92,7 @@ def numbered(paths: Sequence[Path]) -> tuple[Array | None, float]:
 
 
 def _moment(stem: str) -> float:
-    """Time at which a name ends, of a date or in seconds since 1970 [s]; NaN of others."""
+    """Time at which a name ends, of a date or in seconds since 1970 [s]; NaN for other names."""
     if (match := _DATE.search(stem)) is None:
         return np.nan
     *whole, fraction, unix = match.groups("")
@@ -104,7 +104,7 @@ def _moment(stem: str) -> float:
 
 @contextmanager
 def damage_named(label: str, rule: str) -> Iterator[None]:
-    """Make one line of all that a library raises for a damaged file; what names it stays."""
+    """Raise a library's error for a damaged file as one line; errors that name the file stay."""
     try:
         yield
     except DAMAGE as error:
@@ -171,7 +171,7 @@ def smoother(images: Iterable[Any], rearranged: Callable[[Any], Any] = np.ndarra
 
 
 def array_name(names: Collection[str], name: str | None, path: Path, shapes: Sequence[str]) -> str:
-    """Name of an array in a file, which may be left out if there is one alone."""
+    """Name of an array in a file, which may be left out if the file has a single array."""
     if name is None and len(names) == 1:
         return next(iter(names))
     for candidate in (str(name), str(name).strip("/")):

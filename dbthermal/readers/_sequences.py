@@ -25,7 +25,7 @@ _HEADER: Final[np.dtype[Any]] = np.dtype(
         "offsets": [0, 4, 28, 32, 34, 44, 100, 104],
     }
 )
-_COUNTS: Final = (0, 1, 5)  # modes of raw numbers, and those corrected for gain and offset
+_COUNTS: Final = (0, 1, 5)  # modes of raw counts, and of counts corrected for gain and offset
 
 
 def raw(
@@ -195,7 +195,7 @@ def _lines(header: bytes) -> dict[str, str]:
 
 
 def _hcc(path: Path, memory: float) -> tuple[Counts, Array | None]:
-    """Counts of frames that have a header each, and their times, which may be those of a rate."""
+    """Counts of frames that have a header each, and their times, else by the frame rate."""
     first = np.fromfile(path, _HEADER, 1)
     if not first.size or first["signature"][0] != b"TC" or first["length"][0] <= _HEADER.itemsize:
         raise ValueError(f"Invalid header of '{path.name}'. Must begin with TC, as of Telops.")

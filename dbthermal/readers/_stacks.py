@@ -266,7 +266,7 @@ def _pages(path: Path) -> list[_Page]:
 
 
 def _check_apart(file: Any, pages: list[_Page]) -> None:
-    """Raise ValueError where pixels lie over others, or over what describes them."""
+    """Raise ValueError where pixels overlap other pixels, or the tags that describe them."""
     spans = [(start, start + length, True) for page in pages for start, length in page.spans]
     form = file.tiff
     for page in file.pages:

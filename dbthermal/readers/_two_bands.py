@@ -1,4 +1,4 @@
-"""Recordings of one band each as one capture."""
+"""Capture of several bands, from a recording of each band."""
 
 from collections.abc import Sequence
 from datetime import datetime
@@ -125,7 +125,7 @@ def two_bands(
 
 
 def _offsets(cameras: Sequence[xr.Dataset], offset: Any) -> list[float]:
-    """Times from the beginning of the first recording to those of all others [s]."""
+    """Times from the beginning of the first recording to those of the later recordings [s]."""
     if offset is None:
         dates = [recording.attrs.get("start") for recording in cameras]
         if None in dates:
@@ -152,7 +152,7 @@ def _names(bands: Any, number: int) -> list[str]:
 
 
 def _border(counts: npt.NDArray[np.uint16], name: str) -> str:
-    """Sentence on rows and columns at the border of a band that have one value in all frames."""
+    """Sentence on rows and columns at a band's border that have the same value in all frames."""
     sample = counts[:: 1 + len(counts) // _FRAMES]
     padded = (sample == sample[0, 0, 0]) | (sample == sample[0, -1, -1])
     rows, columns = (int(padded.all(axis=axes).sum()) for axes in ((0, 2), (0, 1)))
@@ -177,7 +177,7 @@ def _temperatures(films: list[npt.NDArray[np.uint16]]) -> list[str]:
 
 
 def _check(recording: xr.Dataset, name: str) -> None:
-    """Refuse what is no recording of counts in one band: variables, dims, types, rising times."""
+    """Refuse all but a recording of counts in one band: variables, dims, types, rising times."""
     schema.require(recording, xr.Dataset, f"recording of band '{name}'")
     over_time = dict.fromkeys(("time", "exposure_time", "frame_flags"), ("time",))
     for variable, dims in {"counts": ("time", "y", "x"), **over_time}.items():

@@ -137,7 +137,7 @@ def _save(
             _check_same(rows, first, number)
             # Of all kinds of text zarr's format 3 specifies only that of variable length.
             plain = _with_text_as(rows.drop_encoding(), "U", np.dtypes.StringDType())
-            plain.attrs = attrs  # of each part, or those of the store would be lost
+            plain.attrs = attrs  # each block has them, or zarr drops the store's attributes
             chunks = {n: _chunks(array, *sizes) for n, array in plain.variables.items()}
             encoding = {n: {"chunks": c, "compressors": _COMPRESSORS} for n, c in chunks.items()}
             options: dict[str, Any] = {"mode": "w-", "encoding": encoding}
@@ -199,7 +199,7 @@ def _check(dataset: xr.Dataset) -> None:
 
 
 def _check_same(rows: xr.Dataset, first: xr.Dataset, number: int) -> None:
-    """Refuse a part whose variables, units or coordinates are not those of the first."""
+    """Refuse a block whose variables, units or coordinates differ from the first block's."""
     for name in rows.variables.keys() ^ first.variables.keys():
         raise ValueError(f"Invalid rows {number} with, or without, '{name}'. Must be as the first.")
     for name, variable in rows.isel(y=slice(0), missing_dims="ignore").variables.items():
@@ -335,7 +335,7 @@ def _link(source: str | Path, target: str | Path) -> None:
 
 
 def _with_text_as(dataset: xr.Dataset, kind: str, dtype: np.dtype[Any]) -> xr.Dataset:
-    """Convert text of one of NumPy's kinds to another one."""
+    """Convert text from a kind of NumPy to another kind."""
     texts = {
         name: (variable.dims, variable.to_numpy().astype(object).astype(dtype), variable.attrs)
         for name, variable in dataset.variables.items()

@@ -128,7 +128,7 @@ def reserved(path: str | Path) -> Iterator[Path]:
 
 
 def _restore(place: Path, path: Path) -> None:
-    """Put an earlier result back, if no new one has come to its place."""
+    """Put an earlier result back, if no new result has taken its place."""
     with suppress(OSError):
         if not path.exists():
             (place / _REPLACED).rename(path)
