@@ -24,7 +24,7 @@ from dbthermal import __version__, _cli
 __all__ = ["main"]
 __dir__ = __all__.copy
 
-_EXTRAS: Final = {
+_EXTRAS: Final = {  # library -> the extra that has it
     **dict.fromkeys(("anywidget", "ipywidgets"), "explorer"),
     "jinja2": "report",
     **dict.fromkeys(("pydantic", "serial", "usb", "yaml"), "instruments"),
@@ -33,7 +33,6 @@ _EXTRAS: Final = {
     "matplotlib": "figures",
     "skimage": "materials",
 }
-"""Library -> the extra that has it."""
 
 _KINDS: Final[dict[str, Any]] = {
     "path": Path,
@@ -112,7 +111,7 @@ materials name*         names as listed by 'data'; all by default
 """
 """Argument, kind and help: ``!`` is required, ``&`` may be repeated, ``=`` is the default."""
 
-_VALUES: Final = {
+_VALUES: Final = {  # option -> names of its values in the help, where it is not that of its kind
     "--at": "TEMPERATURE FILE",
     "--sweep": "FOLDER SESSION",
     "--shape": "ROWS COLUMNS",
@@ -120,7 +119,6 @@ _VALUES: Final = {
     "--region": "Y0 Y1 X0 X1",
     "--rows": "Y0 Y1",
 }
-"""Option -> names of its values in the help, where it is not that of its kind."""
 
 _METHODS: Final = (
     "subspace (first step of the default), calibrated (emissivities as stated), "

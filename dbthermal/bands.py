@@ -82,8 +82,7 @@ class Band:
         return self._integral(planck.spectral_radiance_slope, self._within_range(temperature))
 
     def temperature(self, radiance: npt.ArrayLike) -> Array:
-        r"""
-        Temperature [K] of blackbodies of in-band radiances [W m^-2 sr^-1]: inverse of `radiance`.
+        r"""Temperature [K] of blackbodies by in-band radiance [W m^-2 sr^-1]; inverts `radiance`.
 
         Newton's method on :math:`\ln B` as a function of :math:`1/T`, nearly a straight line, run
         until the temperature no longer changes. Raises ValueError for a radiance that is not of a

@@ -20,26 +20,19 @@ __dir__ = __all__.copy
 MINIMUM_FRAMES: Final = 16
 """Fewest frames from which a noise is estimated."""
 
-# Standard deviation of a normal distribution over its median absolute deviation.
-MAD: Final = 1.0 / float(ndtri(0.75))
+MAD: Final = 1.0 / float(ndtri(0.75))  # normal std over the median absolute deviation
 
 _ORDER = 8
-# Square of the Mahalanobis distance within which 99 % of the noise lies.
-_TRIM = float(chdtri(2, 0.01))
+_TRIM = float(chdtri(2, 0.01))  # squared Mahalanobis distance within which 99 % of the noise lies
 _SIGNIFICANCE = 3.0
-# Covariance of a normal distribution cut there, relative to the uncut one.
-_TRIMMED_VARIANCE = float(chdtr(4, _TRIM) / chdtr(2, _TRIM))
+_TRIMMED_VARIANCE = float(chdtr(4, _TRIM) / chdtr(2, _TRIM))  # of noise cut there, over the uncut
 # Standard deviation of a correlation of second differences, times sqrt(frames): their
 # autocorrelation is 1, -2/3, 1/6, so sqrt(1 + 2 (4/9 + 1/36)).
 _CORRELATION_STD = np.sqrt(35.0 / 18.0)
 
 
 def second_difference(signal: Array, time: npt.ArrayLike) -> Array:
-    """Second difference in time of signals (time, pixel), in which white noise keeps its variance.
-
-    Each sample less the line through its two neighbours (time - 2, pixel), over the root of the sum
-    of the squared weights. ValueError for an infinite sample, or times [s] that do not rise.
-    """
+    """Second difference in time of signals (time, pixel); white noise keeps its variance."""
     signal = _numbers.real_numbers("signal", signal)
     if np.any(np.isinf(signal)):
         raise ValueError("Invalid signal: infinite. Must be finite, or NaN.")
@@ -47,6 +40,7 @@ def second_difference(signal: Array, time: npt.ArrayLike) -> Array:
     if np.any(bad := ~(np.diff(time) > 0.0)):
         place = int(np.argmax(bad))
         raise ValueError(f"Invalid time {time[place + 1]} s after {time[place]} s. Must rise.")
+    # Samples less the line through both neighbours, over the root of the sum of squared weights.
     before = ((time[2:] - time[1:-1]) / (time[2:] - time[:-2]))[:, np.newaxis]
     line = before * signal[:-2] + (1.0 - before) * signal[2:]
     return np.asarray((signal[1:-1] - line) / np.sqrt(1.0 + before**2 + (1.0 - before) ** 2))

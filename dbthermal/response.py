@@ -191,7 +191,7 @@ class Accuracy:
     blackbody: float  # [K]
     reflected: float  # by the blackbody, of the room [1]
     room: float  # [K]
-    colour: float  # of what is mirrored, its changes in a band over those in the first, less 1 [1]
+    colour: float  # std of a reflection's changes in a band over its changes in the first [1]
     centre: float  # of the calibrated range [K]
 
     def reading(self, band: int, temperature: npt.ArrayLike) -> Array:
@@ -205,11 +205,7 @@ class Accuracy:
 def accuracy(
     response: xr.Dataset, bands: list[str], reference: Mapping[str, Any] | None = None
 ) -> Accuracy:
-    """Accuracy of some bands of a response, `ACCURACY` where it states none; ValueError for none.
-
-    That is a deviation that is negative or not finite, or an emissivity outside (0, 1]. A reference
-    in view, attribute of a capture, renews the levels at its temperature, and perhaps the gains.
-    """
+    """Accuracy of some bands of a response, by default `ACCURACY`; ValueError outside limits."""
     places, stated = schema.band_positions(response, bands, "the response"), dict[str, Array]()
     limits = {"blackbody_emissivity": (1e-3, 1.0), "room_temperature": _numbers.KELVIN}
     limits |= {"gain_std": (0.0, 1.0), "background_ratio_std": (0.0, 1.0)}  # relative, not in %
@@ -225,7 +221,9 @@ def accuracy(
     blackbody, black = (float(stated[f"blackbody_{name}"]) for name in ("accuracy", "emissivity"))
     centre = 0.5 * float(response["temperature_min"] + response["temperature_max"])
     room, colour = (float(stated[name]) for name in ("room_temperature", "background_ratio_std"))
-    if reference is not None:  # at whose temperature nothing that the blackbody mirrored counts
+    # A reference in view (attribute of a capture) renews the levels at its temperature, where
+    # nothing counts that the blackbody mirrored, and perhaps the gains.
+    if reference is not None:
         left = [reference["bands"][band] for band in bands]
         offset = np.array([of_band["offset_std"] for of_band in left])
         blackbody, centre, room = reference["std"], *2 * (reference["temperature"],)
@@ -276,7 +274,7 @@ def curves(response: xr.Dataset, bands: Sequence[str], kind: str = "exact") -> l
 
 
 def _curve(number: dict[str, float], band: str, kind: str) -> Curve:
-    """Curve of one band, of the numbers of its response."""
+    """Curve of one band, from the coefficients of its response."""
     # Refuse coefficients and a range that are no response.
     if bad := [name for name, value in number.items() if not np.isfinite(value)]:
         raise ValueError(f"Invalid {bad[0]} of the response in band '{band}'. Must be finite.")

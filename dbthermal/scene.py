@@ -29,7 +29,7 @@ __dir__ = __all__.copy
 
 _STEPS: Final[tuple[Callable[..., Any], ...]] = (correct_capture, align, separate)
 SAMPLE: Final = 220  # most memory of a sample of a pixel that is separated in memory [byte]
-ROW: Final = 65  # the same of a sample of a row, where it is by rows, in two threads [byte]
+ROW: Final = 65  # memory of a sample of a row in separation by rows, in two threads [byte]
 
 
 def separate_capture(  # noqa: PLR0913 - the options of each step, by name
@@ -86,7 +86,6 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     -----
     UserWarning
         As the steps.
-
 
     Examples
     --------

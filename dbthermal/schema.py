@@ -101,7 +101,7 @@ NOISE_FACTOR: Final = _of("band", "1", "noise after over noise before the alignm
 PATTERN_STD: Final = _of("band", "count", "standard deviation of the residual fixed pattern")
 """Variable `pattern_std`: what the correction leaves from pixel to pixel, constant in time."""
 
-CAUSES: Final[Mapping[str, str]] = MappingProxyType(
+CAUSES: Final[Mapping[str, str]] = MappingProxyType(  # cause of a deviation -> what shares it
     {
         "noise": "a frame of a pixel",
         "ratio": "all frames of a pixel, or of a material",
@@ -110,21 +110,17 @@ CAUSES: Final[Mapping[str, str]] = MappingProxyType(
         **dict.fromkeys(("offset", "gain", "blackbody", "room", "colour"), "the image"),
     }
 )
-"""Causes of a deviation, and what shares an error by each; all but three are the calibration's."""
-
-# Causes that two bands cannot show (a calibration states them, see `response.accuracy`), and those
-# that a mean over pixels does not lessen.
+# Causes that two bands cannot show (`response.accuracy`); causes that no mean over pixels reduces.
 CALIBRATION: Final = tuple(CAUSES)[3:]
 SHARED: Final = tuple(cause for cause, of in CAUSES.items() if of == "the image")
 
-BUDGETS: Final[Mapping[str, str]] = MappingProxyType(
+BUDGETS: Final[Mapping[str, str]] = MappingProxyType(  # quantity -> its deviation by cause
     {
         "object_temperature": "uncertainty",
         "background_temperature": "background_uncertainty",
         "emissivity": "emissivity_uncertainty",
     }
 )
-"""Quantity of a result -> variable of its deviation by cause."""
 
 SEGMENT: Final = _of("time", "1", "number of shutter events before the frame", "int32")
 """Variable `segment`: how often the offsets were renewed by a shutter event before the frame."""
@@ -244,12 +240,11 @@ LARGEST: Final = 1e9
 """Magnitude from which a number of counts or kelvin is no measurement of any detector."""
 
 EMISSIVITY_LIMITS: Final = (-0.2, 1.05)
-"""A spectral emissivity outside is a wrong unit or a damaged file [1].
-
-The libraries have -0.16 (trona) to 1.014 (maple bark)."""
+"""Limits of a spectral emissivity [1]: beyond, the unit is wrong or the file damaged. The libraries
+have -0.16 (trona) to 1.014 (maple bark)."""
 
 MEASURED: Final = "measured"
-"""Attribute `origin` of what a real camera has recorded; of all else it begins otherwise."""
+"""Attribute `origin` of data that a real camera has recorded; other data have another origin."""
 
 
 def origin(*attrs: Mapping[str, Any]) -> dict[str, str]:
@@ -467,7 +462,7 @@ def check_numbers(array: xr.DataArray, label: str, units: str | None = None) -> 
 
 
 def band_positions(array: xr.DataArray | xr.Dataset, wanted: list[str], label: str) -> list[int]:
-    """Positions of bands by name; ValueError if one, or the coordinate, is missing or repeated."""
+    """Positions of bands by name; ValueError if a band or the coordinate is missing or repeated."""
     require(array, xr.Dataset if isinstance(array, xr.Dataset) else xr.DataArray, label)
     if "band" not in array.coords:
         raise ValueError(f"Missing coordinate 'band' of {label}. Must name each band.")
@@ -495,7 +490,7 @@ def variables(stage: str, values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def require(data: object, kinds: type | tuple[type, ...], label: str) -> None:
-    """Refuse what is of another type."""
+    """Refuse a value of another type."""
     if not isinstance(data, kinds):
         names = [kind.__name__ for kind in (kinds if isinstance(kinds, tuple) else (kinds,))]
         message = f"Invalid {label.removeprefix('the ')} of type {type(data).__name__}"

@@ -17,7 +17,7 @@ from typing import Any, Final
 _UNIT_DOUBTED: Final = 200.0  # from which degrees Celsius, and below which kelvin, are doubted
 PLUS: Final = Path("+")  # between the files of two cameras
 _QUIET, _STEP = 1.5, 0.5  # without a word, and between two looks [s]
-_STAGES: Final = {
+_STAGES: Final = {  # modules -> what is done in them; the innermost of a thread counts
     "numba.core": "compiling, once after an installation for about a minute",
     "dbthermal.separation._completion": "completing",
     "dbthermal.separation._pooling": "grouping pixels by material",
@@ -28,7 +28,6 @@ _STAGES: Final = {
     "dbthermal.store": "reading or writing",
     "dbthermal.figures": "drawing",
 }
-"""Modules -> what is done in them; the innermost of a thread counts."""
 
 
 def leaves(value: Any) -> Iterator[Any]:

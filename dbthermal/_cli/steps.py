@@ -36,8 +36,7 @@ from dbthermal.separation._quality import MOST_MISSING
 from dbthermal.separation._run import BASE
 
 _SWEEP = 64  # frames of each temperature of a blackbody that are taken
-# Of the demonstration.
-_SHAPE: Final = (48, 64)  # rows and columns [pixel]
+_SHAPE: Final = (48, 64)  # rows and columns of the demonstration [pixel]
 _FRAMES, _RATE, _STILL = 200, 10.0, 16  # of the scene, its rate [Hz], and of each temperature
 _CELSIUS: Final = (5, 25, 45, 70)  # of the blackbody
 _PLATE: Final = ["plate window glass", "construction concrete", "ultra flat black paint"]

@@ -27,10 +27,8 @@ TEMPERATURE_STD: Final = 0.1  # of an area blackbody about its reading [K]
 NO_BARS: Final = "maker's constants, without error bars"
 """Attribute ``calibration`` of a response, and of what is made with it."""
 
-# Range of the curve's mean wavelength A + B / T: the band's edges, wider by a factor because a
-# detector is no top hat; the thermal infrared for an unknown band.
-_WAVELENGTH_MARGIN: Final = 1.2
-_THERMAL: Final = bands.Band("thermal infrared", 2e-6, 20e-6)
+_WAVELENGTH_MARGIN: Final = 1.2  # on a band's edges, for A + B / T: a detector is no top hat
+_THERMAL: Final = bands.Band("thermal infrared", 2e-6, 20e-6)  # range of A + B / T, band unknown
 # Range of A T / (A T + B): 1 at one wavelength, 0.94 in 8-14 um, 0.65 in 3-14 um; above 1 only by
 # the nonlinearity of a detector.
 _GROWTH: Final = (0.6, 1.1)
@@ -195,7 +193,7 @@ def fit_response(  # noqa: PLR0913 - what is known of blackbody and cameras, by 
 
 
 def _exchanged(netd: Mapping[str, float]) -> list[str]:
-    """Sentences on bands that are much quieter than one that contains them."""
+    """Sentences on bands that are much quieter than a wider band that contains them."""
     filters = [name for name in netd if name in bands.FILTERS]
     return [
         f"Noise of {netd[inner]:.3g} K in band '{inner}', of {netd[outer]:.3g} K in '{outer}', "
@@ -344,7 +342,7 @@ def _check_residuals(curve: Curve, temperature: Array, counts: Array, std: float
     if np.sum(off**2) <= std**2 * chdtri(counts.size - 2, _FALSE_ALARM):
         return
     explained = f"noise and blackbody explain {std:.3g} count"
-    # Readings without which the others lie on a curve.
+    # Readings without which the remaining readings lie on a curve.
     fitting = []
     for place in range(counts.size):
         remaining = np.arange(counts.size) != place
@@ -378,7 +376,7 @@ def _wavelengths(band: str) -> tuple[float, float]:
 
 
 def fit_band(band: str, temperature: Array, counts: Array) -> Curve:
-    """Curve of least squares of one band."""
+    """Least-squares curve of one band."""
     middle = 0.5 * (temperature[0] + temperature[-1])
     span = counts[-1] - counts[0]
 

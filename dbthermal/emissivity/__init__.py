@@ -42,11 +42,9 @@ by 0.019 of its difference from it; others stop at 12.5 um (0.781)."""
 
 _TABLE = "emissivity_table.csv"
 _MIXTURE = "emissivity_mixture.csv"
-# Materials outside the libraries: share [1], mean, standard deviation of their emissivities, and
-# correlation between two bands.
-_OTHERS = (0.05, 0.7, 0.25, 0.9)
+_OTHERS = (0.05, 0.7, 0.25, 0.9)  # unlisted materials: share; mean, std, correlation of bands [1]
 _GAP = 1e-6  # step of wavelength across which a spectrum is unknown [m]; libraries have 0.1 um
-_STEPS = 64  # of the integral of Planck's law, beside those of the spectrum
+_STEPS = 64  # of the integral of Planck's law, besides the steps of the spectrum
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
 _TEMPERATURE = 300.0  # of the object, at which a noise is stated [K]
 _LIMIT = 5.0  # of a noise [K]; thermopile arrays have 1 K, and the quietest cameras 10 mK
@@ -266,7 +264,7 @@ def _average(
     half = 0.5 * np.diff(knots)[:, np.newaxis]
     nodes = knots[:-1, np.newaxis] + half * (1.0 + _NODES)
     weights = half * _WEIGHTS * planck.spectral_radiance(nodes, temperature)
-    # What is unknown weighs nothing, and lacks in the coverage.
+    # A gap of the spectrum has no weight, and reduces the coverage.
     gap = np.diff(wavelength) > (1.0 + 1e-9) * _GAP
     weights *= ~gap[np.searchsorted(wavelength, nodes[:, 1:2]) - 1]
     covered = float(np.sum(weights))
@@ -327,7 +325,7 @@ class Colour:
 
     @np.errstate(divide="ignore", invalid="ignore")  # in the reference band, which is not scaled
     def scale(self, result: xr.Dataset, before: Array | float = 1.0) -> Array:
-        """Scales s (band, y, x) by what is found with others; 1 where nothing is known."""
+        """Scales s (band, y, x), by a result of other scales; 1 where no ratio is valid."""
         place = [*result["band"].values].index(result.attrs["reference_band"])
         value, g = result["emissivity"].values[place], self.ratio[:, np.newaxis, np.newaxis]
         # With the ratio r = g kappa the null combination is u(x) (e_2 - r e_1) / (1 - r). The slope

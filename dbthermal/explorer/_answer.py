@@ -24,20 +24,15 @@ _NEAREST: Final = 3  # materials that are named
 
 
 def answer(result: xr.Dataset, materials: xr.Dataset | None = None) -> tuple[list[str], Any]:
-    """Sentences on a result for whoever asks how hot it is and how sure, and their numbers.
-
-    Of a result that may be lazy, some rows and frames are read; materials are of the stage
-    `emissivity_table`, `emissivity.embedded_table` by default. The numbers are
-    `object_temperature_degC` (two), `object_temperature_std_K`, by cause, `measured` and
-    `completed` as shares of the pixels, and the list `materials`.
-    """
+    """Sentences on how hot a result is, how sure, and which materials; their numbers by name."""
     table = emissivity.embedded_table() if materials is None else materials
     height, width = result.sizes["y"], result.sizes["x"]
     status = result["status"].values if "status" in result else np.zeros((height, width), np.uint32)
     measured, completed = status == 0, (status & np.uint32(schema.COMPLETED)) != 0
     numbers: dict[str, Any] = {"measured": float(measured.mean())}
     numbers["completed"] = float(completed.mean())
-    # Temperatures of measured pixels, or of all where none is.
+    # Temperatures of the measured pixels, or of all if none is measured, in some rows and frames:
+    # the result may be lazy.
     limits = ((height, _ROWS), (result.sizes["time"], _TIMES))
     rows, times = (slice(0, None, -(-size // most)) for size, most in limits)
     section = result.isel(time=times, y=rows)
@@ -111,7 +106,7 @@ def by_material(result: xr.Dataset, measured: Mask, table: xr.Dataset) -> list[d
     values, stds, drift_stds = values[finite], stds[finite], drift_stds[finite]
     steady_stds = np.sqrt(np.maximum(stds**2 - drift_stds**2, 0.0))
     vague = stds.max(axis=1, initial=0.0) >= _VAGUE
-    # Pixels of one label by their median, which tells materials apart that single pixels do not.
+    # Pixels of a label by their median: it tells materials apart that single pixels do not.
     judged, deviations = values.copy(), stds.copy()
     labels = np.full(len(values), -1)
     if "material" in result:
@@ -119,7 +114,7 @@ def by_material(result: xr.Dataset, measured: Mask, table: xr.Dataset) -> list[d
     for label in np.unique(labels[labels >= 0]):
         judged[labels == label] = np.median(values[labels == label], axis=0)
         deviations[labels == label] = 0.0
-    # Groups of pixels alike the commonest nearest material, then of the rest.
+    # Groups of pixels like the commonest nearest material, then of the remaining pixels.
     groups, free = [vague], ~vague
     if {*bands} <= {*table["band"].values}:
         distances = distance(bands, judged, deviations, table)
@@ -128,7 +123,7 @@ def by_material(result: xr.Dataset, measured: Mask, table: xr.Dataset) -> list[d
             commonest = np.bincount(first[free]).argmax()
             groups.append(free & (distances[:, commonest] < _ALIKE))
             free = free & ~groups[-1]
-    # Medians of each, and the materials within a deviation; none where many are alike.
+    # Medians of each group, and the materials within a deviation; none for the vague group.
     listed = []
     for pixels in (pixels for pixels in groups if pixels.sum() >= max(1, _COMMON * len(values))):
         middle, std, steady = (

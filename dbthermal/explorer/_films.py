@@ -28,7 +28,7 @@ FILMS: Final = {
     "background_temperature": "reflected temperature",
 }
 _LEAST_PAIRS: Final = 12  # pairs of neighbours that give the share of independent errors
-_LARGEST_SHARE: Final = 2.0  # of independent errors in the variance; beyond, of the material
+_LARGEST_SHARE: Final = 2.0  # of independent errors in the variance; beyond, the material differs
 _FEW: Final = 4  # parts of the image, of which one is copied by itself
 _LEAST: Final = {"rectangle": (2, 2), "ellipse": (2, 2), "polygon": (3, 1000)}
 _ONE_BAND: Final = schema.Variable(("time", "y", "x"), "uint16", "count", "raw signal")
@@ -246,8 +246,7 @@ def common_gain(emissivity: Array, covariance: Array) -> Array:
 
     .. math:: \operatorname{med} (g e_i - g e_j)^2 / (v_i + v_j) = 0.455 \rho
 
-    It is 0 for pooled or stated emissivities, and taken as 0 for few pairs and for a material that
-    differs between pixels by more than the deviations. NaN where the emissivities are.
+    The common deviation is NaN where the emissivities are.
     """
     finite = np.isfinite(emissivity).all(axis=0) & np.isfinite(covariance).all(axis=(0, 1))
     # Any system that can be inverted stands in for a pixel without a value.
@@ -267,10 +266,10 @@ def common_gain(emissivity: Array, covariance: Array) -> Array:
         ratios.append(np.reshape(quotient(step**2, total, np.nan), (2, -1)))
     pairs = np.concatenate(ratios, axis=1)
     pairs = pairs[:, np.isfinite(pairs).all(axis=0)]
-    residual_share = np.zeros(2)
+    residual_share = np.zeros(2)  # as of pooled or stated emissivities, also for few pairs
     if pairs.shape[1] >= _LEAST_PAIRS:
         residual_share = np.median(pairs, axis=1) / chdtri(1, 0.5)
-    # Larger steps are of the material: then all of the error counts as common.
+    # Steps larger than the deviations are of the material: then all of the error is common.
     shared = np.where(residual_share < _LARGEST_SHARE, 1.0 - np.minimum(residual_share, 1.0), 1.0)
     return np.asarray(np.sqrt(shared[:, np.newaxis, np.newaxis] * variance))
 
@@ -286,7 +285,7 @@ def mean_std(std: Array, common: Array) -> Array:
 
 
 def statistics(values: npt.NDArray[np.floating]) -> dict[str, Array]:
-    """Mean, least and greatest value (time), and number of pixels with one, of (time, pixel)."""
+    """Mean, least and greatest value (time), and number of valid pixels, of (time, pixel)."""
     finite = np.isfinite(values)
     number = finite.sum(axis=-1)
     total = np.sum(values, axis=-1, where=finite, dtype=np.float64)

@@ -85,7 +85,7 @@ class View:
             raise ValueError("Invalid second capture. The data are a capture: must be a result.")
         if is_capture:
             self.capture, sources = self.data, {"capture": data, "response": response}
-        # What the code that is copied opens: a path, or the name of what is in memory.
+        # Sources in copied code: a path, or the name of a dataset in memory.
         self.sources = {
             name: repr(str(source)) if isinstance(source, str | Path) else name
             for name, source in sources.items()
@@ -115,7 +115,7 @@ class View:
         return self.panes[name]
 
     def frame(self, name: str, index: int) -> Values:
-        """Values (y, x) of a pane at a frame, from 0; ValueError if there is no such one."""
+        """Values (y, x) of a pane at a frame, from 0; ValueError if there is no such frame."""
         if not 0 <= index < self.time.size:
             raise ValueError(f"Invalid frame {index}. Must be from 0 to {self.time.size - 1}.")
         return np.asarray(self.pane(name).read(slice(index, index + 1))[0])
@@ -131,8 +131,7 @@ class View:
     def counted(self, pixels: Pixels = "unflagged") -> Mask:
         """Mask (y, x) of the pixels that count: "unflagged", "measured" or "all".
 
-        Unflagged are measured and completed ones. Of measured pixels samples that were bridged in
-        time do not count, either.
+        Unflagged pixels are measured or completed; "measured" excludes samples bridged in time.
         """
         _text.check_listed("Unknown pixels", pixels, get_args(Pixels))
         if pixels == "all":
@@ -193,7 +192,7 @@ class View:
         schema.require(region, Region, "region")
         if not (mask := region.mask(self.shape)).any():
             raise ValueError(f"Invalid {region}: no pixel of the {self.shape} is inside it.")
-        box = tuple(slice(places.min(), places.max() + 1) for places in np.nonzero(mask))  # of it
+        box = tuple(slice(places.min(), places.max() + 1) for places in np.nonzero(mask))
         pane, where = self.pane(name, *box), (mask & self.counted(pixels))[box]
         gain, base = self._common(pane, box, where), name.removesuffix("_std")
         contrast = [] if gain is None else [self.pane(film, *box) for film in FILMS]
@@ -213,7 +212,7 @@ class View:
                 std = bars.read(frames)[:, where].astype(np.float64)
             if gain is not None:
                 common = gain * np.abs(films[0] - films[1])
-            # What the calibration is taken for is an error of all pixels, besides the noise.
+            # The calibration's deviation is an error that all pixels share, besides the noise.
             finite, shared = np.isfinite(values), self._shared(pane, values, box, where)
             if pane.std:
                 std = np.sqrt(np.maximum(std**2 - shared**2, 0.0))
@@ -271,7 +270,7 @@ class View:
         return responses.accuracy(response, [pane.curve.band], reference).reading(0, values)
 
     def _noise(self, pane: Pane, values: Values) -> Array:
-        """Noise of the samples of a band, with what is left of its pattern; NaN if not known."""
+        """Noise of the samples of a band, with its residual fixed pattern; NaN if unknown."""
         assert self.capture is not None
         holders = [holder for holder in (self.response, self.data) if holder is not None]
         if not (stated := [holder["noise"] for holder in holders if "noise" in holder]):

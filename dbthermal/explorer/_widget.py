@@ -27,14 +27,14 @@ _REFUSED: Final = (ArithmeticError, LookupError, MemoryError, OSError, TypeError
 
 
 def quantised(values: Values, low: float, high: float) -> npt.NDArray[np.uint8]:
-    """Places in a palette: 1 to 255 from the low end of a range to the high one, 0 without one."""
+    """Places in a palette: 1 to 255 from the low to the high end of a range, 0 without a value."""
     with np.errstate(invalid="ignore", over="ignore"):
         codes = (values - np.float32(low)) * np.float32(255.0 / (high - low)) + np.float32(1.0)
     return np.where(schema.measured(values), np.clip(codes, 1.0, 255.0), 0.0).astype(np.uint8)
 
 
 def extremes(values: Values, measured: Mask) -> list[tuple[int, int, float]]:
-    """Row, column and value of the coldest and the hottest measured pixel; none without one."""
+    """Row, column and value of the coldest and the hottest measured pixel, if any is measured."""
     valid = np.where(measured & np.isfinite(values), values, np.nan)
     if not np.isfinite(valid).any():
         return []
@@ -88,7 +88,7 @@ class Explorer(anywidget.AnyWidget):
         return base64.b64encode(buffer.getvalue()).decode()
 
     def _range(self, name: str) -> tuple[float, float]:
-        """Range of colour of a pane, once found."""
+        """Range of colour of a pane, computed once."""
         if name not in self._limits:
             self._limits[name] = self.view.limits(name)
         return self._limits[name]
@@ -161,7 +161,7 @@ class Explorer(anywidget.AnyWidget):
         return {**answer, "ranges": [*ranges.values()]}, [*codes, *sides]
 
     def _frame(self, name: str, request: dict[str, Any]) -> Values:
-        """Frame of a pane, of a film less that of reference if there is one."""
+        """Frame of a pane; of a film its difference from the reference frame, if stated."""
         frame, less = self.view.frame(name, request["index"]), request.get("reference")
         if less is None or self.view.panes[name].kind != "film":
             return frame

@@ -270,7 +270,7 @@ def live(panels: Mapping[str, Panel], *, title: str, foot: str = "") -> Figure:
         draw_image(figure, axis, image, heading, label, cmap=cmap, limits=panel.limits)
         bar = axis.images[0].colorbar
         bar.locator, bar.formatter = MaxNLocator(_TICKS, integer=True), ScalarFormatter()
-        # Its texts.
+        # Texts below and across the picture.
         axis.set_xlabel(panel.text, loc="left", fontsize=9)
         if panel.warning:
             place: dict[str, Any] = {"transform": axis.transAxes, "va": "top", "fontsize": 9}

@@ -15,8 +15,7 @@ from dbthermal import schema
 from dbthermal.figures import drawing
 from dbthermal.figures.drawing import canvas, percent, plain_decades, provenance_note
 
-# Deviations [K] at the ends of the colour map; beyond, a filter is as good or as bad as can be.
-_SCALE: Final = (0.1, 10.0)
+_SCALE: Final = (0.1, 10.0)  # std at the ends of the colours [K]: as good, as bad as can be
 
 _MICRO: Final = "\N{MICRO SIGN}m"
 
@@ -102,8 +101,8 @@ REASONS: Final = MappingProxyType(
         "background_never_rests": ("reflection never rests: emissivity doubtful", "#c7b299"),
     }
 )
-"""Words and colour of each flag, causes before what follows: a pixel with several is drawn as its
-first. What is completed is drawn as that, whatever was the reason not to measure it."""
+"""Words and colour of each flag, causes before consequences: a pixel with several is drawn as its
+first. A completed pixel is drawn as completed, whatever the reason that it is not measured."""
 
 _GOOD: Final = ("no flag", "#a8d5b0")
 

@@ -152,7 +152,7 @@ def _truth(scene: xr.Dataset, *, resting: bool) -> Truth:
         raise ValueError(f"{message}. Must lie in (0, 1).")
     from scipy.stats import mode  # noqa: PLC0415 - slow to import, and nothing else here needs it
 
-    # A pixel rests at its most frequent temperature, the lowest of several, if frames share one.
+    # A pixel rests at its most frequent temperature, the lowest of several, if frames share it.
     level, frames = mode(background, axis=0)
     still = (background == level) & (frames > 1) & resting
     time = scene["time"].values.astype(np.float64)

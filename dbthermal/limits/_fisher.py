@@ -22,12 +22,11 @@ Indices = npt.NDArray[np.intp]
 
 TEMPERATURES: Final = ("object_temperature", "background_temperature")
 QUANTITIES: Final = (*TEMPERATURES, "emissivity", "reflection_ratio")
-"""Quantities that have a bound; those of the bands behind the temperatures, which have frames."""
+"""Quantities that have a bound: of every frame (temperatures), then of every band."""
 
 _NEGLIGIBLE: Final = 0.1  # energy outside the smooth subspace, over the noise's variance
 _HIGHEST_ORDER: Final = 30  # largest subspace that is tried
-# Information below which it is rounding, over that of each parameter as the only unknown.
-_ROUNDING: Final = 1e-12
+_ROUNDING: Final = 1e-12  # of information, relative to a parameter as the only unknown
 _DEPENDENT: Final = 1e-8  # squared share of a gradient along directions without information
 _PIXELS: Final = 512  # at once, in less than 100 MB at 350 frames
 
@@ -197,11 +196,8 @@ def _deviations(
 
 
 def _background(sensitivity: Sensitivity, functions: Array) -> tuple[Array, Array]:
-    r"""Gradient (pixel, time, unknown) of each frame's background, and its variance given them.
-
-    In a free frame y follows the other unknowns: :math:`dy = -v^T (g\,de + p\,dx) / v^T v`, with
-    the variance :math:`1 / v^T v` of its own; at rest it is the level.
-    """
+    """Gradient (pixel, time, unknown) and own variance (pixel, time) of each frame's background."""
+    # A free frame: dy = -v^T (g de + p dx) / v^T v, own variance 1 / v^T v; at rest: the level.
     energy = np.sum(sensitivity.reflection**2, axis=0)
     along = sensitivity.reflection * ~sensitivity.resting / energy
     of_object = np.sum(along * sensitivity.emission, axis=0)

@@ -16,10 +16,8 @@ _NO_FILTER: Final = "none"  # entry of a material whose temperature no filter de
 _TIME_CONSTANT: Final = 1.0 / 3.0  # of the object's warming, as a share of the capture
 SKY_LEVEL: Final = 273.15  # of what is mirrored outdoors, at rest [K]
 SKY: Final = {"8-14": 1.0, "8.5": 1.22, "9.5": 1.47, "10.6": 1.34, "12.1": 0.64}
-"""Changes of a band over those in 8-14 um as clouds pass, of measured spectra [1]_.
-
-.. [1] Atmospheric Radiation Measurement user facility, interferometer's radiances, notebook 15
-"""
+"""Changes of a band over those in 8-14 um as clouds pass, of spectra from the interferometer of the
+Atmospheric Radiation Measurement user facility (radiances, notebook 15)."""
 _MOST_FRAMES: Final = 100_000  # they take some seconds a material
 
 
@@ -142,7 +140,7 @@ def plan(
     bodies = [TopHat(bands.get(name), temperature) for name in names]
     # Deviations of each combination for every material.
     truths = [_truth(design, emissivity[chosen]) for chosen in sets]
-    cases = []  # temperatures (material), the others (band, material)
+    cases = []  # temperatures (material), other quantities (band, material)
     for truth, chosen in zip(truths, sets, strict=True):
         behind, noises = [bodies[band] for band in chosen], std[chosen]
         order = smallest_order(truth, truth.sensitivity(behind, noises))
@@ -156,7 +154,7 @@ def plan(
     labels = [" + ".join(names[place] for place in chosen[1:]) for chosen in sets]
     result = _dataset(table, labels, cases, sets)
     temperatures = [truths[0].object_temperature, truths[0].background_temperature]
-    # Best filter of each material, if it says more than the range of temperatures.
+    # Best filter of each material, if its deviation is below that of a uniform temperature.
     uniform = float(np.ptp(temperatures)) / np.sqrt(12.0)
     total = result["object_temperature_std"].values
     if outdoors:

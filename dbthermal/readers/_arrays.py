@@ -13,7 +13,7 @@ from dbthermal import _numbers, schema
 from dbthermal.readers import _containers, _formats, _recording
 from dbthermal.readers._recording import MEMORY, Clock
 
-# Names of dims by their place, and those of an array without names, of any case.
+# Names of dims by their place, and dims of an array without names, in any case of letters.
 _DIMS: Final = ("time|t|frames?|images?", "y|rows?|height", "x|col(umn)?s?|width")
 _WITHOUT_NAME: Final = r"||None|(phony_)?dim_\d+"
 _NEUTRAL: Final = {"scale_factor": 1, "scale": 1, "slope": 1, "add_offset": 0, "intercept": 0}

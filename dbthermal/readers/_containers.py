@@ -30,8 +30,7 @@ _MOMENT: Final = 40  # longest text of a moment [character]
 _OBJECTS, _DEPTH = 4096, 32  # of a file of HDF5; one with more takes minutes to list
 _LONGEST: Final = 2**10  # of a time [byte]; longer text, as a table in each place, is none
 _CHECKSUMS: Final = ("fletcher32", "crc32", "crc32c", "adler32")
-# Filters of HDF5: that shuffles, that adds a sum of 4 bytes, and those that pack, by their codes.
-_SHUFFLE, _SUM = 2, 3
+_SHUFFLE, _SUM = 2, 3  # codes of HDF5's filters: shuffle, sum of 4 bytes; below, those that pack
 _PACKERS: Final = {1: "zlib", 307: "bz2", 32000: "lzf", 32001: "blosc", 32004: "lz4 of HDF5"}
 _PACKERS.update({32008: "lz4 of HDF5", 32015: "zstd"})  # bitshuffle begins in the same way
 _VLEN: Final = 16  # of a place of text elsewhere in a file of HDF5 [byte]
@@ -41,7 +40,7 @@ _NO_VARIABLE: Final = "This is a netCDF dimension but not a netCDF variable"
 
 
 def dims_of(values: Any) -> list[Any]:
-    """Dims of an array of zarr (2 or 3), h5py, netCDF4 or xarray; empty of one that has none."""
+    """Dims of an array of zarr (2 or 3), h5py, netCDF4 or xarray; empty without names."""
     if isinstance(values, zarr.Array):
         stored: Any = values.attrs.get("_ARRAY_DIMENSIONS", ())
         return [*(getattr(values.metadata, "dimension_names", None) or stored)]
@@ -71,12 +70,12 @@ def attribute(values: Any, name: str) -> Any:
 
 
 def moments(times: Any) -> npt.NDArray[Any] | None:
-    """Times as numbers or dates, those in text as seconds; None of other text."""
+    """Times as numbers or dates, dates in text as seconds; None for other text."""
     if times.dtype.kind in "iufmM":
         return np.asarray(times[...]).reshape(-1)
     seconds = list[float]()
     for number in range(times.size) if times.dtype.kind in "OSU" and times.ndim == 1 else ():
-        text = times[number]  # of any length, which one after another is no danger
+        text = times[number]  # of any length: in memory one by one
         text = text.decode(errors="replace") if isinstance(text, bytes) else str(np.asarray(text))
         try:
             moment = datetime.fromisoformat(text if len(text) <= _MOMENT else "")
@@ -101,13 +100,11 @@ def _times_of(arrays: dict[str, Any], name: str, frames: int) -> dict[str, Any]:
 
 
 def opened(path: Path, name: str | None, stack: ExitStack) -> tuple[Any, dict[str, Any]]:
-    """Array of three dimensions of a file, by its name if there are several; its times by name.
-
-    What the libraries raise until the file is closed names it as damaged.
-    """
+    """Array of three dimensions of a file, by its name if there are several; its times by name."""
     if not (kind := _formats.format_of(path)):
         rule = "Must be .npy, .npz, HDF5, NetCDF, MATLAB or zarr"
         raise ValueError(f"Invalid '{path.name}': of no format, by its first bytes. {rule}.")
+    # Until the file is closed, an error of its library names the file as damaged.
     stack.enter_context(_recording.damage_named(f"Damaged '{path.name}'", f"a whole {kind}"))
     stack.enter_context(warnings.catch_warnings(action="error", category=RuntimeWarning))
     warnings.simplefilter("error", UserWarning)  # as of one dimension twice
@@ -157,7 +154,7 @@ def _hdf5(path: Path, stack: ExitStack) -> dict[str, Any]:
 
 
 def _filters(array: Any, path: Path) -> list[int]:
-    """Codes of the filters of an array of HDF5, of which one packs, behind those that shuffle."""
+    """Codes of the filters of an HDF5 array: shuffles, then at most one filter that packs."""
     h5py, form = _recording.optional("h5py", "recordings"), array.id.get_create_plist()
     filters = [form.get_filter(n) for n in range(form.get_nfilters())]
     codes = [code for code, *_ in filters]
@@ -180,7 +177,7 @@ def check_whole(array: Any, path: Path) -> None:
     """Refuse an array that is not all there, or whose chunks unpack to more than itself."""
     if isinstance(array, zarr.Array):
         _check_chunks(array, path)
-    elif hasattr(array, "is_virtual"):  # of HDF5; one of NetCDF 3 is whole by its header
+    elif hasattr(array, "is_virtual"):  # of HDF5; an array of NetCDF 3 is whole by its header
         _check_pieces(array, path)
 
 
@@ -206,7 +203,7 @@ def _check_pieces(array: Any, path: Path) -> None:
         raise ValueError(f"Missing chunks or filters of '{name}'. Must be {wanted}, all alike.")
     if size > max(_recording.SMALL, array.nbytes):
         raise ValueError(f"Invalid chunk of {size} bytes of '{name}'. Must be its size at most.")
-    # Contents of their size, for HDF5 takes any: one that packing does not shorten is as it is.
+    # HDF5 checks no chunk's size; a chunk that packing does not shorten is stored as it is.
     before, after = (4 * steps.count(_SUM) for steps in (codes[:packer], codes[packer:]))
     for place, mask, length in chunks:
         is_whole = length == size + before + after
@@ -219,9 +216,9 @@ def _check_pieces(array: Any, path: Path) -> None:
 
 
 def _foreign_store(path: Path, _: ExitStack) -> dict[str, Any]:
-    deque(texts.tree_files(path), maxlen=0)  # nothing is opened that is no file in it
+    deque(texts.tree_files(path), maxlen=0)  # refuses links, pipes and devices
     with warnings.catch_warnings(action="ignore", category=UserWarning):  # of other files beside
-        # Each array by its metadata, of which consolidated ones are a copy that may be old.
+        # Each array by its own metadata: consolidated metadata are a copy, which may be old.
         root = zarr.open(str(path), mode="r", use_consolidated=False)
         members: dict[str, Any] = {path.stem: root}
         if isinstance(root, zarr.Group):
@@ -254,7 +251,7 @@ def _check_chunks(values: zarr.Array[Any], path: Path) -> None:
     keys = [file for file in (path / values.path).rglob("*") if re.fullmatch(_CHUNK, file.name)]
     keys = [key for key in keys if key.is_file()]
     _check_unpacked(values, keys, path)
-    # Shards, in which a missing chunk reads as fill values: as other ones with another fill value.
+    # A missing chunk of a shard reads as the fill value: with another fill value it differs.
     if values.shards:
         fill = values.dtype.type(values.fill_value == 0)
         metadata: Any = replace(values.metadata, fill_value=fill)
@@ -264,7 +261,7 @@ def _check_chunks(values: zarr.Array[Any], path: Path) -> None:
             if not np.array_equal(values[frames], refilled[frames]):
                 label = f"Missing chunks in the shards of '{values.path or path.stem}'"
                 raise ValueError(f"{label} of '{path.name}'. Must be whole.")
-    # What pads the last chunks, which is of one value.
+    # The padding of the last chunks must be of one value.
     metadata = values.metadata.update_shape(whole)
     padded = zarr.Array(zarr.AsyncArray(metadata, values.store_path))
     more = len(keys) > math.prod(grid)
@@ -338,7 +335,7 @@ _UNPACKED: Final[dict[str, Callable[[bytes, int], bool]]] = {
     "bz2": _unpacks(bz2.BZ2Decompressor),
     "lzma": _unpacks(lzma.LZMADecompressor),
 }
-_OPENED: Final[dict[str, Callable[[Path, ExitStack], dict[str, Any]]]] = {
+_OPENED: Final[dict[str, Callable[[Path, ExitStack], dict[str, Any]]]] = {  # openers by format
     "zarr": _foreign_store,
     "HDF5": _hdf5,
     "NetCDF": lambda path, _: _variables.netcdf_arrays(path),
@@ -348,4 +345,3 @@ _OPENED: Final[dict[str, Callable[[Path, ExitStack], dict[str, Any]]]] = {
     ),
     "zip": _variables.numpy_arrays,
 }
-"""Format -> function that opens its arrays by name."""

@@ -22,8 +22,7 @@ from dbthermal.readers._flir_records import Content, Frame
 from dbthermal.readers._formats import Paths
 from dbthermal.readers._recording import MEMORY, Clock, Counts, FileFlag
 
-# Place in the camera's record [byte], type, and limits beyond which a value is implausible.
-_FIELDS: Final = {
+_FIELDS: Final = {  # place in the camera's record [byte], type, and limits of plausible values
     "emissivity": (0x20, "f", 0.01, 1.0),
     "object_distance": (0x24, "f", 0.0, 1e4),
     "reflected_temperature": (0x28, "f", 173.0, 373.0),
@@ -250,11 +249,7 @@ def _order(counts: Counts, form: _Image, stated: str | None, name: str) -> tuple
 
 
 def _cameras(listed: Sequence[_Found], *, timed: bool) -> tuple[Array, Mask, dict[str, Any]]:
-    """Times (time) [s], agreement of the numbers (time), attributes, of the camera's records.
-
-    A record whose checksum is wrong, as after its texts were edited, is doubted: its time counts if
-    there is no other. Without times to take, one that is damaged is passed over.
-    """
+    """Times (time) [s], agreement of the numbers (time), attributes, of the camera's records."""
     milliseconds, first = np.full(len(listed), np.nan), dict[str, Any]()
     numbers, doubts = np.zeros((len(listed), 3), dtype=np.int64), dict[int, str]()
     for number, (content, records, place) in enumerate(listed):
@@ -265,7 +260,7 @@ def _cameras(listed: Sequence[_Found], *, timed: bool) -> tuple[Array, Mask, dic
         if fault:
             doubts[number] = f"checksum of the camera's record in {place}, {fault}"
         if len(body) < _CAMERA_SIZE or body[:2] not in {b"\2\0", b"\0\2"}:
-            if not timed:
+            if not timed:  # the clock is stated: no time is needed of a damaged record
                 continue
             label = f"record of the camera in {place}, {len(body)} bytes from {body[:2]!r}"
             rule = f"Must be {_CAMERA_SIZE} at least, and begin with 2; with clock= it is not read"
@@ -280,7 +275,7 @@ def _cameras(listed: Sequence[_Found], *, timed: bool) -> tuple[Array, Mask, dic
         whole, thousandths = struct.unpack_from(f"{order}II", body, _TIME)
         if whole:
             milliseconds[number] = whole * 1000 + (thousandths & 0xFFFF)
-        # Settings and constants, which must stay those of the first frame.
+        # Settings and constants, which must not change after the first frame.
         camera = {
             key: struct.unpack_from(order + code, body, start)[0]
             for key, (start, code, *_) in _FIELDS.items()
@@ -291,6 +286,7 @@ def _cameras(listed: Sequence[_Found], *, timed: bool) -> tuple[Array, Mask, dic
                 change = f"{key} {camera[key]:g} of {place}, {first[key]:g} before"
                 rule = "Must be one range of the camera: select its frames by frames="
                 raise ValueError(f"Invalid {change}. {rule}.")
+    # Times of records with a wrong checksum, as of edited texts, count if there are no others.
     if len(doubts) < len(listed):
         milliseconds[[*doubts]] = np.nan
     first_time = milliseconds[np.isfinite(milliseconds)][:1]
@@ -301,15 +297,12 @@ def _cameras(listed: Sequence[_Found], *, timed: bool) -> tuple[Array, Mask, dic
 
 
 def _numbers_agree(numbers: npt.NDArray[np.int64]) -> Mask:
-    """Agreement (time) of the numbers (time, [file, image, camera]) of frames.
-
-    Each may count from a start of its own, or not at all; in a file the two must rise together.
-    """
+    """Agreement (time) of the numbers (time, [file, image, camera]) of frames."""
     agree = np.ones(len(numbers), dtype=bool)
     for file in np.unique(numbers[:, 0]):
         (frames,) = np.nonzero(numbers[:, 0] == file)
         image, camera = numbers[frames, 1:].T
-        if np.ptp(image) and np.ptp(camera):
+        if np.ptp(image) and np.ptp(camera):  # both count, each from any start: they rise together
             apart, shares = np.unique((image - camera) % 2**16, return_counts=True)
             usual = apart[shares.argmax()] if 2 * shares.max() > len(frames) else 0
             agree[frames] = (image - camera) % 2**16 == usual
@@ -317,11 +310,11 @@ def _numbers_agree(numbers: npt.NDArray[np.int64]) -> Mask:
 
 
 def _attrs(camera: dict[str, Any], seconds: float | None = None) -> dict[str, Any]:
-    """Attributes of a camera's record: its values as written, and those that cannot be meant."""
+    """Attributes of a camera's record: its values as written, and the implausible values."""
     body, attrs, implausible = camera.pop("body"), dict[str, Any](), list[str]()
     for key, value in camera.items():
         _, code, low, high = _FIELDS[key]
-        # The shortest number that is this one of 32 bit: 0.95, not 0.949999988.
+        # Shortest decimal that is the same 32-bit number: 0.95, not 0.949999988.
         number = float(str(np.float32(value))) if code == "f" else int(value)
         if not low <= number <= high:
             celsius = f" K ({number - 273.15:.1f} degrees Celsius)" if "temp" in key else ""

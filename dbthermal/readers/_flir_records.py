@@ -40,11 +40,7 @@ Frame = Mapping[int, Record]  # record by its type
 
 
 def frames(content: Content, name: str, *, still: bool) -> Iterator[Frame]:
-    """Yield the records of each frame of a file; ValueError by frame and byte where damaged.
-
-    Behind the last record lie zeros, or bytes that fill up to a multiple of 4. A still has one
-    frame: what follows without a mark fills it up.
-    """
+    """Yield the records of each frame of a file; ValueError by frame and byte where damaged."""
     at: int | None = 0
     number = 0
     while at is not None:
@@ -54,7 +50,8 @@ def frames(content: Content, name: str, *, still: bool) -> Iterator[Frame]:
 
 
 def _following(content: Content, start: int, stop: int, *, still: bool) -> int | None:
-    """Place of the frame behind one that lies from start to stop; None at the end of the file."""
+    """Place of the frame behind a frame from start to stop; None at the end of the file."""
+    # Behind the last record lie zeros, or bytes that fill the frame up to a multiple of 4.
     filled = start + -(-(stop - start) // _ALIGNED) * _ALIGNED
     for behind in (stop, filled):
         if (byte := _NO_ZERO.search(content, behind)) is None:
@@ -62,11 +59,11 @@ def _following(content: Content, start: int, stop: int, *, still: bool) -> int |
         at, head = byte.start(), content[byte.start() : byte.start() + _HEADER]
         if any(mark.startswith(head[: len(mark)]) for mark in _MARKS):
             return at
-    return None if still or len(head) < _HEADER else at
+    return None if still or len(head) < _HEADER else at  # a still has one frame, then filling
 
 
 def body(content: Content, record: Record) -> tuple[bytes, str]:
-    """Bytes of a record, and a sentence on its checksum if it has one that is wrong."""
+    """Bytes of a record, and a sentence on its checksum if that is wrong."""
     value = content[record.start : record.stop]
     if record.checksum in {0, checksum := zlib.crc32(value)}:
         return value, ""
@@ -104,7 +101,7 @@ def of_jpeg(content: Content, name: str) -> bytes:
 
 
 def _frame(content: Content, at: int, place: str) -> tuple[Frame, int]:
-    """Records of the frame that begins at a byte, and the byte after its last one."""
+    """Records of the frame that begins at a byte, and the byte after its last record."""
     size = len(content)
     # Header, and the byte order by its version.
     if (mark := content[at : at + 4]) not in _MARKS or at + _HEADER > size:

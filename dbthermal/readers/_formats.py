@@ -9,8 +9,7 @@ from dbthermal import _text as texts
 
 Paths = str | Path | Sequence[str | Path]
 
-# First bytes of a format: place, bytes, and its name.
-_MAGIC: Final = (
+_MAGIC: Final = (  # first bytes of a format: place, bytes, and its name
     *((0, mark, "FLIR") for mark in (b"FFF\0", b"AFF\0")),
     *((0, mark, "TIFF") for mark in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")),
     *((0, mark, "NetCDF") for mark in (b"CDF\1", b"CDF\2", b"CDF\5")),
@@ -35,7 +34,7 @@ _DRAWN: Final = (
     "most have 8 bits that are drawn, not measured: record 16-bit counts; one of 16-bit counts is "
     "read by readers.raw after: ffmpeg -i FILE -pix_fmt gray16le -f rawvideo counts.raw"
 )
-_FOREIGN: Final = {
+_FOREIGN: Final = {  # what to do with a format that no reader opens, by suffix or first bytes
     **dict.fromkeys((".ravi", ".irb", ".ats", ".is2", ".is3", ".bmt", ".ptw"), _EXPORT),
     **dict.fromkeys(("film", "picture"), _DRAWN),
     "HDF4": "convert it by h4toh5 and use readers.array",
@@ -44,7 +43,6 @@ _FOREIGN: Final = {
     **dict.fromkeys(("PGM", "JPEG 2000"), "save it as PNG of 16 bits and use readers.tiff"),
     "text": "a table of temperatures, or a page of a server? Export 16-bit counts as TIFF",
 }
-"""What to do with a format that no reader opens, by suffix or first bytes."""
 _LARGEST: Final = 2**46  # of a file that is not read at once [byte]
 _TEXT: Final = 512  # bytes at the beginning of a file, without a control character
 _UTF16: Final = (b"\xff\xfe", b"\xfe\xff")  # marks at the beginning of a text

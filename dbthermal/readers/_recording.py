@@ -30,30 +30,26 @@ MEMORY: Final = 2.0**30  # largest memory that a recording may take, by default 
 _FASTEST: Final = 1e6  # frame rate of a camera [Hz]
 _STEPS: Final = (1e-3, 1.0)  # between frames whose times have no unit and are seconds [s]
 _GAP: Final = 1.5  # a step of the clock longer than this many frame periods tells of a lost frame
-# What the libraries of the formats raise for files that are damaged.
-DAMAGE: Final = (
+DAMAGE: Final = (  # what the libraries of the formats raise for files that are damaged
     *(ArithmeticError, AssertionError, AttributeError, EOFError, LookupError, MemoryError, OSError),
     *(RuntimeError, SyntaxError, SystemError, TypeError, ValueError, Warning, TokenError),
     *(lzma.LZMAError, struct.error, zipfile.BadZipFile, zlib.error),
 )
-# Factor by which an image is smoother than with bytes swapped or rows cut elsewhere, or unclear.
-SMOOTHER: Final = 2.0
+SMOOTHER: Final = 2.0  # times smoother than with bytes swapped or rows cut elsewhere, or unclear
 _ALONG: Final = 64  # samples along each axis that tell which of them is time
 _APART: Final = 1.3  # axes whose roughness differs by this factor are of another kind
-# Most bytes of counts in a byte of a file: the .csq at hand has 11, its counts in a packed TIFF 3.
-_PACKED: Final = 64
-SMALL: Final = 2**26  # beyond which a recording is held against that [byte]
+_PACKED: Final = 64  # most bytes of counts in a byte of a file; .csq at hand 11, packed TIFF 3
+SMALL: Final = 2**26  # size beyond which a recording is compared with its file [byte]
 _PIECES: Final = 2**14  # of less than 1 kB in a file
 ORDERS: Final = {"<": "little", ">": "big"}  # of bytes, as numpy and people write them
 _JITTER: Final = 0.25  # of the times in names of files [frame]
 _DATE: Final = re.compile(
     r"(20\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)(?:\D?(\d+))?$|(1\d{9}\.\d+)$"
 )
-# Names of a digital number, and of units of time.
-_COUNTS: Final = re.compile(
+_COUNTS: Final = re.compile(  # names of a digital number
     r"(raw|adc|camera|digital)?[ _]?(counts?|numbers?|levels?|values?)|dn|adu|lsb", re.IGNORECASE
 )
-_SECONDS: Final = {
+_SECONDS: Final = {  # names of units of time, and their seconds
     r"s(ec(ond)?s?)?": 1.0,
     r"m(illi)?s(ec(ond)?s?)?": 1e-3,
     r"(u|\N{MICRO SIGN}|\N{GREEK SMALL LETTER MU}|micro)s(ec(ond)?s?)?": 1e-6,
@@ -83,7 +79,7 @@ def numbered(paths: Sequence[Path]) -> tuple[Array | None, float]:
     is_dated, counting = np.isfinite(moments).all(), np.flatnonzero(np.ptp(table, axis=0))
     if not is_dated and counting.size != 1:  # parts of a recording
         return None, 0.0
-    # Whole multiples of the usual step are frames that are missing; dates are right to a part.
+    # Multiples of the usual step are missing frames; dates are right to a fraction of a frame.
     steps = np.diff(moments if is_dated else table[:, counting[0]])
     usual = float(np.percentile(steps, 50, method="lower") or 1.0)
     places = np.rint(apart := steps / usual)
@@ -96,7 +92,7 @@ def numbered(paths: Sequence[Path]) -> tuple[Array | None, float]:
 
 
 def _moment(stem: str) -> float:
-    """Time at which a name ends, of a date or in seconds since 1970 [s]; NaN of others."""
+    """Time at which a name ends, of a date or in seconds since 1970 [s]; NaN for other names."""
     if (match := _DATE.search(stem)) is None:
         return np.nan
     *whole, fraction, unix = match.groups("")
@@ -108,7 +104,7 @@ def _moment(stem: str) -> float:
 
 @contextmanager
 def damage_named(label: str, rule: str) -> Iterator[None]:
-    """Make one line of all that a library raises for a damaged file; what names it stays."""
+    """Raise a library's error for a damaged file as one line; errors that name the file stay."""
     try:
         yield
     except DAMAGE as error:
@@ -165,7 +161,7 @@ def film(values: Any) -> Counts:
 
 
 def smoother(images: Iterable[Any], rearranged: Callable[[Any], Any] = np.ndarray.byteswap) -> int:
-    """Form in which the first clear image is smoother: 1 as it is, -1 the other, 0 unclear."""
+    """Smoother form of the first clear image: 1 as it is, -1 rearranged, 0 if all are unclear."""
     for frame in images:
         forms = (frame.astype(np.int32), rearranged(frame).astype(np.int32))
         as_is, swapped = (sum(np.abs(np.diff(it, axis=n)).sum() for n in (0, 1)) for it in forms)
@@ -175,7 +171,7 @@ def smoother(images: Iterable[Any], rearranged: Callable[[Any], Any] = np.ndarra
 
 
 def array_name(names: Collection[str], name: str | None, path: Path, shapes: Sequence[str]) -> str:
-    """Name of an array in a file, which may be left out if there is one alone."""
+    """Name of an array in a file, which may be left out if the file has a single array."""
     if name is None and len(names) == 1:
         return next(iter(names))
     for candidate in () if name is None else (str(name), str(name).strip("/")):
@@ -315,15 +311,12 @@ def clocked(counts: Counts, clock: Clock, name: str, *sentences: str, **attrs: s
 
 
 def _time_elsewhere(counts: Counts, name: str) -> list[str]:
-    """Sentence on counts (time, y, x) whose time may be along another axis.
-
-    Rows and columns are about as rough; time is smoother, or changes faster. Roughness is the mean
-    second difference without its largest quarter, and that of rounding.
-    """
+    """Sentence on counts (time, y, x) whose time may be along another axis."""
     sides = [slice(max(0, (n - _ALONG) // 2), (n + _ALONG) // 2) for n in counts.shape]
     middle = counts[tuple(sides)]
     if min(middle.shape) < 8:
         return []
+    # Roughness of an axis: mean second difference without its largest quarter, plus rounding.
     rough = list[float]()
     for axis in range(3):
         means = middle.mean(axis=tuple({0, 1, 2} - {axis}), keepdims=True)
@@ -331,7 +324,7 @@ def _time_elsewhere(counts: Counts, name: str) -> list[str]:
         values = middle - (means if turns > steps else 0.0)  # without a pattern of columns
         bends = np.sort(np.abs(np.diff(values, 2, axis=axis)), axis=None)
         rough.append(float(np.log(bends[: 3 * bends.size // 4].mean() + 0.3)))
-    for axis, like in ((1, 2), (2, 1)):
+    for axis, like in ((1, 2), (2, 1)):  # rows are about as rough as columns, time is not
         alike, unlike = abs(rough[0] - rough[like]), np.abs(np.subtract(rough, rough[axis]))
         if max(SMOOTHER * alike, np.log(_APART)) < np.delete(unlike, axis).min():
             rule = "Must be (time, y, x): transpose it if it is not"

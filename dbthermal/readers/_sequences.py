@@ -25,7 +25,7 @@ _HEADER: Final[np.dtype[Any]] = np.dtype(
         "offsets": [0, 4, 28, 32, 34, 44, 100, 104],
     }
 )
-_COUNTS: Final = (0, 1, 5)  # modes of raw numbers, and those corrected for gain and offset
+_COUNTS: Final = (0, 1, 5)  # modes of raw counts, and of counts corrected for gain and offset
 
 
 def raw(
@@ -101,7 +101,7 @@ def _other_height(counts: Counts) -> list[str]:
     height, rows = counts.shape[1], np.concatenate(counts[: 2 * _FIRST]).astype(np.int32)
 
     def change(distance: int) -> float:
-        """Usual change from a row to that so far below."""
+        """Median change from a row to the row at a distance below."""
         return float(np.median(np.abs(rows[distance:] - rows[:-distance])) + 0.5)
 
     tried = [height // n for n in (4, 3, 2) if height % n == 0] + [n * height for n in range(1, 5)]
@@ -114,7 +114,7 @@ def _other_height(counts: Counts) -> list[str]:
 
 
 def _are_longer(counts: Counts) -> bool:
-    """Tell whether numbers are parts of longer ones: neighbours, or every fourth, are rougher."""
+    """Tell whether numbers are parts of longer numbers: neighbours or some fourths are rougher."""
     values = counts[0].ravel().astype(np.int32)
     if values.size < _FIRST * 4:
         return False
@@ -195,7 +195,7 @@ def _lines(header: bytes) -> dict[str, str]:
 
 
 def _hcc(path: Path, memory: float) -> tuple[Counts, Array | None]:
-    """Counts of frames that have a header each, and their times, which may be those of a rate."""
+    """Counts of frames that have a header each, and their times, else by the frame rate."""
     first = np.fromfile(path, _HEADER, 1)
     if not first.size or first["signature"][0] != b"TC" or first["length"][0] <= _HEADER.itemsize:
         raise ValueError(f"Invalid header of '{path.name}'. Must begin with TC, as of Telops.")

@@ -20,9 +20,7 @@ from dbthermal.readers import _formats, _recording
 from dbthermal.readers._formats import Paths
 from dbthermal.readers._recording import MEMORY, Clock, Counts
 
-# What a page must say: the attribute of tifffile's page, or the tag, which is 1 where it is
-# missing; its name in messages, and the value.
-_FORM: Final = (
+_FORM: Final = (  # tifffile's attribute of a page, or a tag (1 if missing); name, value, rule
     ("bitspersample", "bits of a pixel", 16, "16: counts, not a picture"),
     ("sampleformat", "sample format", 1, "1: whole numbers from 0, counts and no temperatures"),
     ("is_reduced", "preview", False, "False: a frame, not a smaller copy of one"),
@@ -39,8 +37,7 @@ _SCALING: Final = re.compile(r"<Item\b[^<>]{0,200}\brole=.(scale|offset).[^<>]{0
 _LOSSLESS: Final = "LZW, deflate, PackBits, LZMA, Zstandard"
 _AT_ONCE: Final = 2**25  # of a span [byte]
 _TILE: Final = 2**19  # that tiles may have beyond 8 times their image [byte]
-# A unit of the values in a description: as ImageJ, and as JSON, write it.
-_TEMPERATURES: Final = re.compile(
+_TEMPERATURES: Final = re.compile(  # unit of values in a description, as of ImageJ or in JSON
     r"""(?im)\b(?:v|value[ _]?)?units?["']?\s*[:=]\s*["']?(?:[0-9./]+ ?)?"""
     r"""([cm]?K|C|(?:centi|milli)?kelvins?|(?:deg[a-z]*|\N{DEGREE SIGN})?[ _]*(?:C|celsius))\b"""
 )
@@ -64,8 +61,8 @@ def tiff(
 ) -> xr.Dataset:
     """Counts of a TIFF or BigTIFF stack, or of one TIFF or PNG a frame, in 16 bits.
 
-    These do not tell the unit, and rarely times. An interval of frames, or times, in a description
-    of ImageJ or OME must agree with the clock, or serves as one; "origin: simulated" is kept.
+    Such files tell no unit, and rarely times. An interval of frames, or times, in a description of
+    ImageJ or OME must agree with the clock, or serves as the clock; "origin: simulated" is kept.
 
     OSError if a file cannot be opened, ImportError without the extra ``recordings``; TypeError or
     ValueError if the unit is another one; a file is damaged, or holds two bands or other axes; a
@@ -269,7 +266,7 @@ def _pages(path: Path) -> list[_Page]:
 
 
 def _check_apart(file: Any, pages: list[_Page]) -> None:
-    """Raise ValueError where pixels lie over others, or over what describes them."""
+    """Raise ValueError where pixels overlap other pixels, or the tags that describe them."""
     spans = [(start, start + length, True) for page in pages for start, length in page.spans]
     form = file.tiff
     for page in file.pages:

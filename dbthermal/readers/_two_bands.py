@@ -1,4 +1,4 @@
-"""Recordings of one band each as one capture."""
+"""Capture of several bands, from a recording of each band."""
 
 from collections.abc import Sequence
 from datetime import datetime
@@ -17,8 +17,8 @@ from dbthermal._warnings import warned
 from dbthermal.readers._recording import FileFlag
 
 _SCENE: Final = (5.0, 100.0)  # temperatures of a scene [degC]
-_FRAMES: Final = 16  # about as many of them tell
-_ALIKE: Final = 5.0  # between the medians of two bands [K]
+_FRAMES: Final = 16  # about as many frames are sampled
+_ALIKE: Final = 5.0  # largest difference of the medians of two bands [K]
 
 
 def two_bands(
@@ -89,7 +89,7 @@ def two_bands(
         later, spans = (" and ".join(f"{it:g}" for it in each) for each in (shifts[1:], stops))
         label = f"Invalid offset {later} s: the recordings of {spans} s do not overlap"
         raise ValueError(f"{label}. Must overlap; give offset= if a camera's clock is wrong.")
-    # As many cameras, not a file named twice.
+    # No two recordings may have the same counts, as of a file that is named twice.
     overlapping = [recording["counts"].values[: min(lengths)] for recording in cameras]
     for film, other_film in combinations(overlapping, 2):
         if all(np.array_equal(film[at], other_film[at]) for at in parts(film)):
@@ -125,7 +125,7 @@ def two_bands(
 
 
 def _offsets(cameras: Sequence[xr.Dataset], offset: Any) -> list[float]:
-    """Times from the beginning of the first recording to those of all others [s]."""
+    """Times from the beginning of the first recording to those of the later recordings [s]."""
     if offset is None:
         dates = [recording.attrs.get("start") for recording in cameras]
         if None in dates:
@@ -143,7 +143,7 @@ def _offsets(cameras: Sequence[xr.Dataset], offset: Any) -> list[float]:
 
 
 def _names(bands: Any, number: int) -> list[str]:
-    """Names of so many bands, which must be texts, and differ."""
+    """Names of the bands, which must be different texts, as many as stated."""
     listed = bands if isinstance(bands, Sequence) and not isinstance(bands, str) else []
     names = [str(name) for name in listed if isinstance(name, str) and name.strip()]
     if not len({*names}) == len(listed) == number:
@@ -152,7 +152,7 @@ def _names(bands: Any, number: int) -> list[str]:
 
 
 def _border(counts: npt.NDArray[np.uint16], name: str) -> str:
-    """Sentence on rows and columns at the border of a band that have one value in all frames."""
+    """Sentence on rows and columns at a band's border that have the same value in all frames."""
     sample = counts[:: 1 + len(counts) // _FRAMES]
     padded = (sample == sample[0, 0, 0]) | (sample == sample[0, -1, -1])
     rows, columns = (int(padded.all(axis=axes).sum()) for axes in ((0, 2), (0, 1)))
@@ -177,7 +177,7 @@ def _temperatures(films: list[npt.NDArray[np.uint16]]) -> list[str]:
 
 
 def _check(recording: xr.Dataset, name: str) -> None:
-    """Refuse what is no recording of counts in one band: variables, dims, types, rising times."""
+    """Refuse all but a recording of counts in one band: variables, dims, types, rising times."""
     schema.require(recording, xr.Dataset, f"recording of band '{name}'")
     over_time = dict.fromkeys(("time", "exposure_time", "frame_flags"), ("time",))
     for variable, dims in {"counts": ("time", "y", "x"), **over_time}.items():

@@ -21,8 +21,7 @@ from dbthermal._arrays import empty, parts
 from dbthermal.readers import _recording as recordings
 
 _NUMPY_HEADER: Final = 2**16  # of NumPy's format, at most [byte]
-# MATLAB: types of numbers as they are stored, and as it has them.
-_STORED: Final = dict(
+_STORED: Final = dict(  # MATLAB's types of stored numbers; `_CLASSES` are those of its arrays
     enumerate(["i1", "u1", "i2", "u2", "i4", "u4", "f4", "-", "f8", "-", "-", "i8", "u8"], 1)
 )
 _CLASSES: Final = dict(enumerate(["f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"], 6))
@@ -138,10 +137,8 @@ class Numbers(Unread):
 
 
 def matlab_arrays(path: Path) -> dict[str, Numbers]:
-    """Numeric arrays of MATLAB by name; ValueError unless the file ends where its variables do.
-
-    Versions 5 to 7, from the maker's "MAT-File Format". SciPy's reader crashes on damaged files.
-    """
+    """Numeric arrays of MATLAB by name; ValueError unless the file ends where its variables do."""
+    # Versions 5 to 7, from the maker's "MAT-File Format": SciPy's reader crashes on damaged files.
     listed, at, size = dict[str, Numbers](), _BEGIN, path.stat().st_size
     with path.open("rb") as stream:
         order = {b"IM": "<", b"MI": ">"}[stream.read(_BEGIN)[-2:]]
@@ -200,15 +197,13 @@ def _elements(head: bytes, order: str) -> Iterator[tuple[int, int, int]]:
 
 
 def netcdf_arrays(path: Path) -> dict[str, xr.Variable]:
-    """Variables of NetCDF 3, not yet read; ValueError unless the file ends where its header says.
-
-    Its three forms (offsets of 32 and 64 bits, data of 64 bits), from the specification of Unidata,
-    "NetCDF Classic Format": variables over the dim of length 0 lie in records, a slab of each.
-    """
+    """Variables of NetCDF 3, unread; ValueError unless the file ends where its header says."""
+    # Offsets of 32 and 64 bits, and data of 64 bits, from Unidata's "NetCDF Classic Format".
     with path.open("rb") as stream:
         header = _Header(stream.read(_NETCDF_HEADER))
     forms, file_size = header.variables(), path.stat().st_size
-    # Size of a variable or its slab, and of a record; a single slab is not filled up.
+    # Variables over the dim of length 0 lie in records, a slab of each variable, filled up unless
+    # there is only one slab: sizes of variables or slabs, and of a record.
     sizes = {name: math.prod(shape) * dtype.itemsize for name, (*_, shape, dtype) in forms.items()}
     recorded = [name for name, (dims, _, _, shape, _) in forms.items() if len(dims) > len(shape)]
     record = sum(-(-sizes[name] // 4) * 4 for name in recorded)  # each filled up

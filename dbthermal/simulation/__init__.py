@@ -84,7 +84,7 @@ class Background:
                 start = rng.uniform(time[0], time[-1], pixels)
                 stop = start + rng.uniform(*self.duration, pixels)
                 active = (time[:, np.newaxis] >= start) & (time[:, np.newaxis] < stop)
-                # Pulses beyond the number of a pixel are drawn, and stay out.
+                # Pulses beyond the pixel's number are drawn, but not added.
                 change += self.amplitude * (active & (pulse < number))
         elif self.kind == "random walk":
             change = self._walk(time, pixels, rng)

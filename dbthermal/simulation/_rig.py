@@ -84,7 +84,7 @@ class Rig:
 
 
 def _blackbody(response: xr.Dataset, temperature: xr.DataArray) -> list[np.ndarray]:
-    """Counts of a blackbody in each band; a temperature may be one for each of the bands."""
+    """Counts of a blackbody in each band; the temperature may differ between the bands."""
     names = [str(name) for name in response["band"].values]
     levels = [temperature] * len(names)
     if "band" in temperature.dims:

@@ -22,12 +22,11 @@ from dbthermal.store import _integrity as integrity
 from dbthermal.store._results import as_json
 from dbthermal.store._whole import whole
 
-# Next to no time beside that of the writing, and smaller than Zstandard without a shuffle of bytes.
+# Fast beside the writing, and smaller than Zstandard without a shuffle of bytes.
 _COMPRESSORS = (BloscCodec(cname="lz4", clevel=1, shuffle="shuffle"), Crc32cCodec())
 _CHUNK_BYTES: Final = 2**20  # of a full chunk, at least: below, a read costs more in files
 
-# Names of variables, which are folders on any disk; coordinates are listed, parted by spaces.
-_NAME: Final = re.compile(
+_NAME: Final = re.compile(  # of a variable, a folder on any disk; spaces part coordinates
     r"(?!__|.{61}|(?i:con|prn|aux|nul|(com|lpt)\d)(\.|$))\w([\w.()+-]| (?=[\w(]))*(?<!\.)"
 )
 _RESERVED: Final = {integrity.GROUP, integrity.SUMS}
@@ -138,7 +137,7 @@ def _save(
             _check_same(rows, first, number)
             # Of all kinds of text zarr's format 3 specifies only that of variable length.
             plain = _with_text_as(rows.drop_encoding(), "U", np.dtypes.StringDType())
-            plain.attrs = attrs  # of each part, or those of the store would be lost
+            plain.attrs = attrs  # each block has them, or zarr drops the store's attributes
             chunks = {n: _chunks(array, *sizes) for n, array in plain.variables.items()}
             encoding = {n: {"chunks": c, "compressors": _COMPRESSORS} for n, c in chunks.items()}
             options: dict[str, Any] = {"mode": "w-", "encoding": encoding}
@@ -163,7 +162,7 @@ def chunks_in_turn() -> AbstractContextManager[Any]:
 
 
 def _check(dataset: xr.Dataset) -> None:
-    """Refuse values that zarr cannot hold, and attributes that it cannot, or would decode by."""
+    """Refuse values and attributes that zarr cannot hold, and attributes that decode values."""
     # Attributes of the dataset and its variables.
     attributes = {f"'{name}'": variable.attrs for name, variable in dataset.variables.items()}
     for owner, attrs in {"the dataset": dataset.attrs, **attributes}.items():
@@ -200,7 +199,7 @@ def _check(dataset: xr.Dataset) -> None:
 
 
 def _check_same(rows: xr.Dataset, first: xr.Dataset, number: int) -> None:
-    """Refuse a part whose variables, units or coordinates are not those of the first."""
+    """Refuse a block whose variables, units or coordinates differ from the first block's."""
     for name in rows.variables.keys() ^ first.variables.keys():
         raise ValueError(f"Invalid rows {number} with, or without, '{name}'. Must be as the first.")
     for name, variable in rows.isel(y=slice(0), missing_dims="ignore").variables.items():
@@ -253,7 +252,7 @@ def open_dataset(path: str | Path) -> xr.Dataset:
         opened = (_open(checked, leave=names - {name}) for name in sorted(names))
         valid = {dim: slice(end) for dim, end in ends.items()}
         arrays = [array.isel(valid, missing_dims="ignore") for array in opened]
-        # The attributes as checked, for they may have gone on since.
+        # Attributes as checked: the recording may have grown since.
         dataset = xr.merge(arrays, combine_attrs="override").assign_attrs(checked.attrs)
     for name in integrity.MARK:
         dataset.attrs.pop(name, None)
@@ -302,7 +301,7 @@ def join_parts(
         sums = integrity.last_sums(folder)
         (folder / integrity.SUMS).unlink()
         (folder / integrity.SUMS).write_bytes(integrity.sums_file(sums))
-        # The chunks of all others in their places; zarr replaces what it writes, and no link.
+        # Chunks of the further folders in their places; zarr replaces files, and writes in no link.
         for name, array in zarr.open_group(integrity.SummedStore(folder), mode="r+").arrays():
             metadata: Any = array.metadata
             dims, shape = [*(metadata.dimension_names or ())], [*array.shape]
@@ -336,7 +335,7 @@ def _link(source: str | Path, target: str | Path) -> None:
 
 
 def _with_text_as(dataset: xr.Dataset, kind: str, dtype: np.dtype[Any]) -> xr.Dataset:
-    """Convert text of one of NumPy's kinds to another one."""
+    """Convert text from a kind of NumPy to another kind."""
     texts = {
         name: (variable.dims, variable.to_numpy().astype(object).astype(dtype), variable.attrs)
         for name, variable in dataset.variables.items()

@@ -1,10 +1,9 @@
 """Checksums of a store: of every file when it is written, compared when it is read.
 
-``checksums.sfv`` in the folder has a line for each file: its name and its CRC-32, as programs for
-"simple file verification" read them. A line is appended before its file is written: a recording
-that is cut short at any moment has the lines of all that is valid. A file that was replaced has a
-line for each state until the recording is closed. A file that is damaged, cut, missing, foreign or
-in another's place is then seen: metadata and names when the store is opened, values when read.
+``checksums.sfv`` has a line for each file, its name and CRC-32, as programs for "simple file
+verification" read it, written before the file: a recording cut short has the lines of all valid
+files. A replaced file has a line for each state until the recording is closed. A damaged, cut,
+missing, foreign or exchanged file is seen: metadata and names on opening, values on reading.
 
 The codec crc32c of zarr sees every damaged chunk, but not flipped bits of metadata, exchanged
 chunks, edited attributes, lost or renamed arrays, foreign files, or chunks missing in a recording.
@@ -35,7 +34,7 @@ SUMS: Final = "checksums.sfv"
 MARK: Final = MappingProxyType({"checksums": f"CRC-32 of every file, in {SUMS}"})
 """Attribute of every store with checksums, so that their loss is seen."""
 GROWING: Final = MappingProxyType({"checksums": f"{MARK['checksums']}, and of earlier states"})
-"""The same of a recording that is not closed; a result made of it has `MARK`, whatever it says."""
+"""Mark of a recording that is not closed; a result made of the recording has `MARK` again."""
 
 
 class SummedStore(LocalStore):
@@ -64,8 +63,8 @@ class CheckedStore(SummedStore):
 
     def __init__(self, root: Path | str, *, read_only: bool = True) -> None:  # noqa: ARG002 - zarr's
         super().__init__(root, read_only=True)
-        deque(texts.tree_files(self.root), maxlen=0)  # nothing is opened that is no file in it
-        # Before the checksums, which may grow, and again if they have: it was closed just then.
+        deque(texts.tree_files(self.root), maxlen=0)  # refuses links, pipes and devices
+        # Read before the checksums, which may grow, and again if the recording was just closed.
         self.closed, content = False, self._content(GROUP)
         self._sums = dict.fromkeys(_read_sums(self.root))
         if not _is_listed(self._sums, GROUP, content):
@@ -82,7 +81,7 @@ class CheckedStore(SummedStore):
             raise ValueError(f"Invalid store '{self.root}', an array. {rule}.")
         mark = {name: self.attrs[name] for name in MARK if name in self.attrs}
         self.closed = mark != GROWING if mark else bool(self.attrs.get("closed", True))
-        # Of a recording that is not closed the valid part counts, without its time.
+        # A recording that is not closed is read as far as it is valid, without its time.
         self.hidden = () if self.closed else (TIME,)
         # The list of files, unless the store is of version 0.1.0, without one.
         if mark and not self._sums:

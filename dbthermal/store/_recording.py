@@ -1,10 +1,9 @@
 """A recording that grows in chunks along time and is readable at any moment.
 
-The folder is a zarr store (format 3) from the first moment on. Chunks are written and synced to the
-disk first; then ``zarr.json``, which says how many frames are valid, is replaced in one step. Valid
-chunks are never written over in place. A kill or a power loss thus leaves a store without the chunk
-that was being written: ``complete`` is False and ``frames_written`` is where each band ends. The
-folder is held by its descriptor: renamed or moved, the recording goes on in it.
+The folder is a zarr store (format 3) from the first moment on. Chunks are synced to the disk; then
+``zarr.json``, with the number of valid frames, is replaced in one step. Valid chunks are never
+overwritten in place. A kill or a power loss costs the chunk being written: ``complete`` is False
+and ``frames_written`` is where each band ends. The folder is held by its descriptor if it moves.
 """
 
 import errno
@@ -32,8 +31,7 @@ Values = npt.NDArray[Any]
 _LOG_CHUNK: Final = 4096  # rows of a chunk of the log
 _LOOKS: Final = 10  # for a folder, which may be moved while its path is read and compared
 _STAY: Final = "Must stay while it is written to"
-# A chunk of zeros is written too: a missing one was never recorded.
-_FORM: Final[Any] = {
+_FORM: Final[Any] = {  # chunks of zeros are written, too: a missing chunk was never recorded
     "compressors": (BloscCodec(cname="lz4", clevel=1, shuffle="bitshuffle"), Crc32cCodec()),
     "config": {"write_empty_chunks": True},
 }
@@ -93,7 +91,7 @@ class Recording:
                 "band", data=names, dimension_names=("band",), **_FORM
             )
             self._folder = HeldFolder(draft, self.path)
-        # From here on it is written to wherever it is moved.
+        # From here on the recording is written wherever its folder is moved.
         self.root = self._store.root = self._folder.root
         self._inside = {name: (self.root / name).stat() for name in self._arrays}
 
@@ -222,12 +220,12 @@ class HeldFolder:
     Parameters
     ----------
     folder, path : Path
-        That exists (OSError otherwise); where it will be moved next, if that is another place.
+        Existing folder (OSError otherwise); where it will be moved next, by default nowhere.
 
     Attributes
     ----------
     root, close : Path, callable
-        Leads into it, wherever it is; without a /proc, as on macOS, its path. Lets it go.
+        Path into the folder, wherever it is moved (its path without /proc, as on macOS); frees it.
     """
 
     def __init__(self, folder: Path, path: Path | None = None) -> None:

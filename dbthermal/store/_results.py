@@ -101,7 +101,7 @@ def commit() -> str:
 def _git(folder: Path, *arguments: str) -> str:
     """Output of a git command in `folder`; empty if it fails or git is absent."""
     command = ["git", "-C", str(folder), *arguments]
-    # Not those of another clone, as a hook of git has them.
+    # Without variables of another clone, as a hook of git has them.
     environment = {name: it for name, it in os.environ.items() if not name.startswith("GIT_")}
     environment["GIT_OPTIONAL_LOCKS"] = "0"
     try:
@@ -129,7 +129,7 @@ def save_text(text: str, path: str | Path, provenance: Mapping[str, Any]) -> Non
         Text, file ``*.md`` or ``*.html``; see `save`.
     """
     suffix = ".html" if _text.as_path(path).suffix == ".html" else ".md"
-    # A string in it can neither end the comment nor begin a tag.
+    # No string of the provenance can end the comment or begin a tag.
     content = as_json(provenance).replace("--", "-\\u002d").replace("<", "\\u003c")
     with whole(path, suffix) as draft:
         draft.write_text(f"{text}\n<!-- {content} -->\n", encoding="utf-8")

@@ -1,8 +1,8 @@
 """Files and folders that appear whole under their names, and belong to one process meanwhile.
 
-What is written lies in a hidden folder beside its place until it is whole and on the disk; then it
-is renamed. Signals that end the program are raised as errors, so that it is ended first. The
-content is synced before the rename, the folder after it: a power loss leaves no name without it.
+Output lies in a hidden folder beside its place until it is whole and synced to the disk; then it is
+renamed, and its folder synced: a power loss leaves no name without content. Signals that end the
+program are raised as errors, so that the writing ends first.
 """
 
 import errno
@@ -32,7 +32,7 @@ _BUSY: Final = "Busy output '{}': {} writes to it. Must end first, or another ou
 _STATUS: Final = 128  # exit status of a shell's program that a signal ended, less its number
 _ENDING: Final = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
 _REPLACED: Final = "replaced"  # an earlier result, until the new one has its name
-_LOCKED: Final[set[int]] = set()  # open locks, which a fork must not inherit: they die with us
+_LOCKED: Final[set[int]] = set()  # open locks, which a fork must not inherit: they end with us
 
 
 def _leave_to_parent() -> None:
@@ -45,7 +45,7 @@ if hasattr(os, "register_at_fork"):
 
 
 def check_place(path: str | Path, suffix: str) -> Path:
-    """Refuse the path of a file or folder of another end than this, or inside a store."""
+    """Path of an output; refuses another suffix, a link, foreign content, a place in a store."""
     path = texts.as_path(path)
     if path.suffix != suffix:
         raise ValueError(f"Invalid path '{path}'. Must end in '{suffix}', after a name.")
@@ -118,7 +118,7 @@ def reserved(path: str | Path) -> Iterator[Path]:
     with raised_signals(), _reasons(path, folder):
         try:
             with raised_signals(deferred=True):
-                if (lock := _lock(folder, path)) is not None:  # by this process already otherwise
+                if (lock := _lock(folder, path)) is not None:  # else locked by this process
                     _remove_remains(folder, path)
             yield folder
         finally:
@@ -128,7 +128,7 @@ def reserved(path: str | Path) -> Iterator[Path]:
 
 
 def _restore(place: Path, path: Path) -> None:
-    """Put an earlier result back, if no new one has come to its place."""
+    """Put an earlier result back, if no new result has taken its place."""
     with suppress(OSError):
         if not path.exists():
             (place / _REPLACED).rename(path)
@@ -144,7 +144,7 @@ def _remove_remains(folder: Path, path: Path) -> None:
 def _lock(folder: Path, path: Path) -> int | None:
     """Lock a file in a folder, which names this process; None if this process has done so."""
     name, file = f"process {os.getpid()} on {platform.node()}", folder / "holder"
-    while True:  # for its holder may remove it before it is locked
+    while True:  # its holder may remove the file before it is locked
         folder.mkdir(parents=True, exist_ok=True)
         if folder.is_symlink():  # to a folder in which nothing may be removed
             raise ValueError(f"Invalid folder '{folder}', a link. Must be a folder: delete it.")
@@ -217,7 +217,7 @@ def _reasons(path: Path, folder: Path) -> Iterator[None]:
 
 
 def replace(path: Path, content: bytes, before: Iterable[Path] = ()) -> None:
-    """Replace a file in one step, after others are on the disk; a power loss leaves old or new."""
+    """Replace a file in one step, once `before` is on the disk; a power loss leaves old or new."""
     draft = path.with_name(f".{path.name}.part")
     try:
         draft.write_bytes(content)
@@ -302,7 +302,7 @@ def raised_signals(*, deferred: bool = False) -> Iterator[None]:
             raise SignalExit(number)
 
     try:
-        # Only in the main thread, which gets them, and only what the program does not ignore.
+        # Only the main thread gets signals; signals that the program ignores stay ignored.
         if threading.current_thread() is threading.main_thread():
             for number in _ENDING:
                 handler = signal.getsignal(number)
