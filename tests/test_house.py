@@ -10,23 +10,23 @@ HOUSE = Path(dbthermal.__file__).parent
 
 # Lines and modules that a room may have. A room that grows takes from another; these only fall.
 BUDGET = {
-    "": (3522, 18),
-    "_cli": (1246, 5),
+    "": (3505, 18),
+    "_cli": (1244, 5),
     "alignment": (2819, 10),
-    "calibration": (795, 2),
+    "calibration": (793, 2),
     "correction": (1726, 6),
-    "emissivity": (423, 1),
-    "explorer": (1275, 6),
-    "figures": (596, 3),
+    "emissivity": (421, 1),
+    "explorer": (1268, 6),
+    "figures": (595, 3),
     "instruments": (5345, 19),
-    "limits": (719, 3),
-    "readers": (2701, 12),
+    "limits": (713, 3),
+    "readers": (2670, 12),
     "reporting": (393, 1),
-    "separation": (12847, 54),
+    "separation": (12858, 54),
     "simulation": (564, 2),
-    "store": (1380, 6),
+    "store": (1376, 6),
 }
-INSTALLED = 36_351  # lines of all rooms
+INSTALLED = 36_290  # lines of all rooms
 
 PRONOUNS = {
     *("one", "other", "others", "own", "part", "parts", "some", "here", "there", "told", "known"),

@@ -271,7 +271,8 @@ def _displacement(first: Array, second: Array, drift: Array, noise: Array) -> tu
     most = np.argsort(slow[rapid < _RAPID * slow])[-_MOST:]
     first, second = first[:_ORDER], second[:_ORDER]
     path, none = np.zeros(PARAMETERS), np.zeros(PARAMETERS)
-    # Gauss-Newton, from coarse detail to fine.
+    # Gauss-Newton, from coarse detail to fine, as far as both bands show it.
+    finest = None
     for blur in _BLURS:
         views = _Views(first, second, drift, pixels[:, most], blur)
         path = path if path.any() else views.nearest()
@@ -279,7 +280,7 @@ def _displacement(first: Array, second: Array, drift: Array, noise: Array) -> tu
         for _ in range(_TURNS):
             scale, remainder, alike = views.compared(path)
             if np.count_nonzero(alike) < _FEWEST:
-                return none, none
+                break
             least = variance[1] + scale**2 * variance[0]
             weight = (scale / np.maximum(np.mean(remainder**2, axis=(0, 2)), least))[alike]
             slopes, residual = views.slopes[:, :, alike], remainder[:, alike]
@@ -292,6 +293,15 @@ def _displacement(first: Array, second: Array, drift: Array, noise: Array) -> tu
             path = path + np.clip(step, -_STEP, _STEP)
             if np.sqrt(np.mean(step**2)) < _SETTLED:
                 break
+        if np.count_nonzero(alike) < _FEWEST:
+            break
+        # The coarsest detail tells where to begin; finer detail counts if most windows show it
+        # (with fewer, 1 of 400 scenes was moved that lay right), or if it is the finest.
+        if blur == _BLURS[-1] or (blur < _BLURS[0] and np.mean(alike) > 0.5):
+            finest = views, path, spread, alike
+    if finest is None:
+        return none, none
+    views, path, spread, alike = finest
     # Compare what the bands do not have in common with the motion and without it.
     after, before = (np.sum(views.compared(it)[1] ** 2, axis=(0, 2)) for it in (path, none))
     explained = np.median(quotient(after[alike], before[alike], 1.0)) < _LEFT

@@ -66,6 +66,7 @@ WORLDS: dict[str, tuple[World, str, str]] = {
     "breathing skin": (World(breath=0.5, detail=0.003, surface=(SKIN, SKIN)), "image moved", ""),
 }
 QUICK = list(WORLDS)[:8]
+FURTHER = {"never registered": (5,), "never registered, apart": (5,)}  # seeds, beside 1 and 2
 CLOCKS = [name for name in WORLDS if WORLDS[name][0].clocks]
 LEAST, FEW, MOST_RMSE, MOST_FAR = 0.9, 0.05, 1.3, 1e-3
 # By situation and seed: what is not reached.
@@ -98,7 +99,7 @@ def outcome(name: str, seed: int) -> tuple[float, float, float, tuple[str, ...]]
 def cases() -> Iterator[Any]:
     """Yield each situation with two seeds; most are slow, and some are known to miss."""
     for name in WORLDS:
-        for seed in (1, 2):
+        for seed in (1, 2, *FURTHER.get(name, ())):
             slow = [] if name in QUICK and seed == 1 else [pytest.mark.slow]
             reason = MISSED.get((name, seed))
             missed = [pytest.mark.xfail(reason=reason, strict=True)] if reason else []
