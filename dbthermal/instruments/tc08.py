@@ -214,7 +214,7 @@ class TC08(Closing):
         self.channels = dict(channels)
 
     def read(self, channel: int) -> float:
-        """Temperature of a channel [K]; `ReadingError` if it is none, else as `single`."""
+        """Temperature of a channel [K]; `ReadingError` if open or overflowed, else as `single`."""
         # A scan serves all channels: it is used while it is new, and once by each.
         with self.clock.hold(self._lock):
             scan = self._scan

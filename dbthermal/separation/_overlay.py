@@ -270,31 +270,15 @@ def _displacement(first: Array, second: Array, drift: Array, noise: Array) -> tu
     pixels = pixels[:, rapid < _RAPID * slow]
     most = np.argsort(slow[rapid < _RAPID * slow])[-_MOST:]
     first, second = first[:_ORDER], second[:_ORDER]
-    path, none = np.zeros(PARAMETERS), np.zeros(PARAMETERS)
-    # Gauss-Newton, from coarse detail to fine, as far as both bands show it.
-    finest = None
+    path, none, finest = np.zeros(PARAMETERS), np.zeros(PARAMETERS), None
+    # From coarse detail to fine, as far as both bands show it.
     for blur in _BLURS:
         views = _Views(first, second, drift, pixels[:, most], blur)
-        path = path if path.any() else views.nearest()
-        variance = noise**2 / (4.0 * np.pi * blur**2)
-        for _ in range(_TURNS):
-            scale, remainder, alike = views.compared(path)
-            if np.count_nonzero(alike) < _FEWEST:
-                break
-            least = variance[1] + scale**2 * variance[0]
-            weight = (scale / np.maximum(np.mean(remainder**2, axis=(0, 2)), least))[alike]
-            slopes, residual = views.slopes[:, :, alike], remainder[:, alike]
-            form = np.einsum("w,afwp,bfwp->wab", weight * scale[alike], slopes, slopes)
-            force = np.einsum("w,afwp,fwp->wa", weight, slopes, residual)
-            steps, spreads = jackknife(
-                form, force, np.eye(len(slopes)) / _PRIOR**2, np.append(path, [0.0, 0.0])
-            )
-            step, spread = steps[:PARAMETERS], spreads[:PARAMETERS]
-            path = path + np.clip(step, -_STEP, _STEP)
-            if np.sqrt(np.mean(step**2)) < _SETTLED:
-                break
-        if np.count_nonzero(alike) < _FEWEST:
+        start = path if path.any() else views.nearest()
+        level = _refined(views, start, noise**2 / (4.0 * np.pi * blur**2))
+        if level is None:
             break
+        path, spread, alike = level
         # The coarsest detail tells where to begin; finer detail counts if most windows show it
         # (with fewer, 1 of 400 scenes was moved that lay right), or if it is the finest.
         if blur == _BLURS[-1] or (blur < _BLURS[0] and np.mean(alike) > 0.5):
@@ -308,3 +292,22 @@ def _displacement(first: Array, second: Array, drift: Array, noise: Array) -> tu
     sure = np.any(quotient(path**2, spread, 0.0) > SURE)
     # No motion that is unsure, too small to matter, or does not explain the difference.
     return (path, spread) if sure and explained and size_of(path) > _LEAST else (none, none)
+
+
+def _refined(views: _Views, path: Array, variance: Array) -> tuple[Array, Array, Mask] | None:
+    """Motion (parameter) [pixel] by Gauss-Newton, its variance, and windows alike; None of few."""
+    for _ in range(_TURNS):
+        scale, remainder, alike = views.compared(path)
+        if np.count_nonzero(alike) < _FEWEST:
+            return None
+        least = variance[1] + scale**2 * variance[0]
+        weight = (scale / np.maximum(np.mean(remainder**2, axis=(0, 2)), least))[alike]
+        slopes, residual = views.slopes[:, :, alike], remainder[:, alike]
+        form = np.einsum("w,afwp,bfwp->wab", weight * scale[alike], slopes, slopes)
+        force = np.einsum("w,afwp,fwp->wa", weight, slopes, residual)
+        prior, before = np.eye(len(slopes)) / _PRIOR**2, np.append(path, [0.0, 0.0])
+        step, spread = (values[:PARAMETERS] for values in jackknife(form, force, prior, before))
+        path = path + np.clip(step, -_STEP, _STEP)
+        if np.sqrt(np.mean(step**2)) < _SETTLED:
+            break
+    return path, spread, alike

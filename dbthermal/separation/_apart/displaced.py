@@ -49,7 +49,7 @@ Paired: TypeAlias = tuple[Array, Mask, Mask, Bits, Array]
 
 
 class Resampled(NamedTuple):
-    """What the second camera shows of the reflections in some rows, as it is kept."""
+    """Samples of the second camera, resampled to the reflections that some rows show."""
 
     counts: npt.NDArray[np.float32]  # of its bands (band, time, pixel) [count]
     packed: npt.NDArray[np.uint8] | None  # bits of samples that are valid (time, pixel); None: all
@@ -196,8 +196,7 @@ def paired(
     """Read some pixels of some rows as `read` does, their short gaps bridged."""
     # Samples of the second camera are kept, in single precision: they are not resampled again.
     kept, place, bands = displacement.kept, (rows.start, rows.stop), capture.sizes["band"]
-    resampled = kept.get(place)
-    if resampled is None:
+    if (resampled := kept.get(place)) is None:
         block, grains = load()
         counts, valid, status, gain = read(block, displacement, rows, source, fewest, grains)
         packed = None if valid.all() else np.packbits(valid, axis=0)

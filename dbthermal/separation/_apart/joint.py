@@ -111,8 +111,7 @@ class Joint:
     frames: Frames
     signals: Floats  # of the object at r and at p (2, node, pixel) [K]; NaN unknown
     emissivity: Floats  # of which it is made (band, pixel) [1]
-    # Variance of the object over that of a pixel alone (pixel) [1], by threads.
-    factor: Callable[[Executor], Floats]
+    factor: Callable[[Executor], Floats]  # variance over that of a pixel alone (pixel) [1]
     unsettled: Mask  # the iteration did not come to an end (pixel)
 
     def difference(self, pixels: Whole, frames: slice | Whole = slice(None)) -> Floats:
@@ -140,8 +139,8 @@ class Joint:
             film = smooth.bridge(film, np.ones(film.shape[1], dtype=bool))
             return np.asarray(basis.T @ film)
 
-        every = list(threads.map(smoothed, self.inputs.blocks))
-        curves = np.concatenate(every, axis=1).reshape(-1, *status.shape)
+        curves = np.concatenate([*threads.map(smoothed, self.inputs.blocks)], axis=1)
+        curves = curves.reshape(-1, *status.shape)
         # Beside a pixel without a background it is taken to go on.
         lost = np.isnan(curves[0])
         near = distance_transform_edt(lost, return_distances=False, return_indices=True)
@@ -204,25 +203,7 @@ def solve(
             target, size = _by_maps(inputs, maps, raw, material, result, places)
         else:
             target, size = _by_film(inputs, result, raw, equations, shares, before)
-
-        def objects_at(
-            frames: Whole, equations: system.Equations, start: Floats | None = None
-        ) -> tuple[Floats, Floats]:
-            """Object at both places (2, frame, solved) [K] and its last step, of some frames."""
-            packed, films = equations.packed, np.empty((2, frames.size, places.size), np.float32)
-
-            @np.errstate(invalid="ignore", divide="ignore", over="ignore")  # of the thread
-            def solve_some(few: slice) -> Floats:
-                combination, guess = target(frames[few])
-                if start is not None:
-                    guess = np.where(np.isfinite(start[few].T), start[few].T, guess)
-                at_r, at_p, step = packed.solve(combination, guess, change.at(frames[few]))
-                films[0, few], films[1, few] = at_r.T, at_p.T
-                return step
-
-            few = [slice(first, first + _FRAMES) for first in range(0, frames.size, _FRAMES)]
-            return films, np.fmax.reduce([*threads.map(solve_some, few)])
-
+        objects_at = partial(_objects_at, target, change, threads)
         # The object at both places at a few frames: does its gradient matter?
         start = None
         if sampled is frames.nodes and before is not None and before.frames.smooth:
@@ -239,8 +220,7 @@ def solve(
             of_slope = np.where(unknown, np.nan_to_num(variance), material.noise_variance)
             of_ratio = system.of_ratio(inputs, material)
         elif not inputs.method.knows_emissivity:
-            first, steps = system.samples(inputs, sampled)
-            band = first[:, places], steps[:, places]
+            band = [values[:, places] for values in system.samples(inputs, sampled)]
             solve_at = partial(objects_at, sampled)
             equations, emissivity, of_slope = _emissivities(
                 inputs, result, raw, equations, solve_at, films, band, threads
@@ -249,7 +229,7 @@ def solve(
         off = equations.spread(np.mean((films[1] - films[0]) ** 2, axis=0))
         if sampled is not frames.nodes:
             films, step = objects_at(frames.nodes, equations)
-        signals, unsettled = _spread(films, step, solved.size, places)
+        signals, unsettled = _spread(films, step, equations)
         # An error of c_1 = w_1 e_1 is one of all c: dq = (de_1 w_1 + e_1 dw_1) [u(x(r)) - u(x(p))].
         off *= system.weights(inputs, emissivity)[0] ** 2 * of_slope + emissivity[0] ** 2 * of_ratio
         sizes = equations.spread(size), np.where(solved, np.sqrt(np.nan_to_num(off)), 0.0)
@@ -272,17 +252,39 @@ def _solvable(
     return raw, variance, solved & np.all(np.isfinite(raw), axis=0)
 
 
-def _spread(films: Floats, step: Floats, pixels: int, places: Whole) -> tuple[Floats, Mask]:
+def _spread(films: Floats, step: Floats, equations: system.Equations) -> tuple[Floats, Mask]:
     """Signals (2, node, pixel) [K] of solved pixels, and the pixels that go on moving."""
-    signals = np.full((*films.shape[:2], pixels), np.nan, np.float32)
-    signals[..., places] = np.where(np.abs(films) > USELESS, np.nan, films)
-    unsettled = np.zeros(pixels, dtype=bool)
-    unsettled[places] = step > 10.0 * relaxation.CONVERGED
-    return signals, unsettled
+    signals = np.full((*films.shape[:2], equations.first.size), np.nan, np.float32)
+    signals[..., equations.solved] = np.where(np.abs(films) > USELESS, np.nan, films)
+    return signals, equations.spread(step > 10.0 * relaxation.CONVERGED)
 
 
 Target: TypeAlias = Callable[[Whole], tuple[Floats, Floats]]
 """Combination without background, and a start (solved, frame) [K], at some frames."""
+
+
+def _objects_at(
+    target: Target,
+    change: system.Change,
+    threads: Executor,
+    frames: Whole,
+    equations: system.Equations,
+    start: Floats | None = None,
+) -> tuple[Floats, Floats]:
+    """Object at both places (2, frame, solved) [K] and its last step, of some frames."""
+    packed, films = equations.packed, np.empty((2, frames.size, equations.solved.size), np.float32)
+
+    @np.errstate(invalid="ignore", divide="ignore", over="ignore")  # of the thread
+    def solve_some(few: slice) -> Floats:
+        combination, guess = target(frames[few])
+        if start is not None:
+            guess = np.where(np.isfinite(start[few].T), start[few].T, guess)
+        at_r, at_p, step = packed.solve(combination, guess, change.at(frames[few]))
+        films[0, few], films[1, few] = at_r.T, at_p.T
+        return step
+
+    few = [slice(first, first + _FRAMES) for first in range(0, frames.size, _FRAMES)]
+    return films, np.fmax.reduce([*threads.map(solve_some, few)])
 
 
 def _by_maps(
@@ -356,7 +358,7 @@ def _emissivities(
     equations: system.Equations,
     solve_at: Callable[[system.Equations, Floats], tuple[Floats, Floats]],
     films: Floats,
-    band: tuple[Floats, Floats],
+    band: list[Floats],
     threads: Executor,
 ) -> tuple[system.Equations, Floats, Floats]:
     """Equations and emissivities of the object at its own place, and the variance of e_1."""
@@ -381,8 +383,7 @@ def _emissivities(
             first=np.where(solved, emissivity[0], 1.0),
             shares=system.coefficients(inputs, emissivity, solved),
         )
-        change = np.abs(emissivity - before)[0, solved]
-        if _most(change) < _SETTLED:
+        if _most(np.abs(emissivity - before)[0, solved]) < _SETTLED:
             break
         films, _ = solve_at(equations, films[0])
     return equations, emissivity, variance
@@ -390,7 +391,7 @@ def _emissivities(
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def _emission(
-    films: Floats, band: tuple[Floats, Floats], emissivity: Floats, noise: float, few: slice
+    films: Floats, band: list[Floats], emissivity: Floats, noise: float, few: slice
 ) -> tuple[Floats, Floats, Mask]:
     """Emissivity of the first band as its slope over the object, its variance, and its validity."""
     # Object at both places (2, frame, solved) [K]; band: signal, steps of the camera in it [K].
