@@ -31,7 +31,7 @@ _TOGETHER: Final = 2**24
 
 # Pixels from which the noise is estimated, and a clock is judged.
 _NOISE_PIXELS, _CLOCK_PIXELS = 4096, 256
-_NOISE_SAMPLES: Final = 2**19  # of a band, at most: fewer prove no noise 1.4 times the stated
+_NOISE_SAMPLES: Final = 2**19  # of a band, at most: fewer prove no larger noise than stated
 # Deviation from an even clock up to which times are not judged by the signals [mean step].
 _NEARLY_EVEN: Final = 1.0
 _READ: Final = ("counts", "status", "segment", "noise_factor", "pattern_std")

@@ -77,7 +77,7 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         "calibrated" take two bands or more, the former 32 frames or more; other methods two bands.
     response : Dataset
         From `calibration.fit_response`, with all bands. Its `noise` (band) [count] is used, times
-        the `noise_factor` (band) of the capture, unless the capture proves 1.4 times as much: then
+        the `noise_factor` (band) of the capture, unless the capture proves 1.1 times as much: then
         the capture's, with a warning. Without `noise` it is estimated from the capture. Attribute
         `noise_source` says which.
     method : {"subspace", "calibrated", "apparent"} or Method

@@ -70,10 +70,7 @@ def test_bad_pixels_cost_no_more_than_their_surroundings() -> None:
     assert float(apart.max()) < 0.5  # K
 
 
-MISSED = pytest.mark.xfail(reason="the largest error is 0.5004 K", strict=True)
-
-
-@pytest.mark.parametrize("seed", [pytest.param(1, marks=MISSED), 2])
+@pytest.mark.parametrize("seed", [1, 2, 3])
 def test_stuck_pixels_do_not_reach_their_surroundings(seed: int) -> None:
     """A pixel that is far too warm in the first band passes for no change of the object."""
     scene = painted(seed, picture=SMALL, time=TIME, shift=STRAIGHT)
@@ -83,11 +80,15 @@ def test_stuck_pixels_do_not_reach_their_surroundings(seed: int) -> None:
     counts = capture["counts"].where(stuck == 0, 2.0 * float(capture["counts"][0].max()))
     noisy = counts + np.random.default_rng(1).normal(0.0, 3.0, counts.shape)
     bad = capture.assign(counts=noisy.astype(np.float32), status=(("y", "x"), stuck))
-    result = separation.solve(bad, RIG.response(), reflection_shift=field(shift))
+    with pytest.warns(UserWarning, match="The noise of the capture, which is used"):
+        result = separation.solve(bad, RIG.response(), reflection_shift=field(shift))
     error = abs(result["object_temperature"] - scene.truth["object_temperature"]).mean("time")
-    error = error.where(result["status"] == 0)
-    assert float(error.notnull().mean()) > 0.75
-    assert float(error.max()) < 0.4
+    std = result["object_temperature_std"].mean("time").where(result["status"] == 0)
+    assert float(std.notnull().mean()) > 0.87
+    # At the upper border hardly anything is mirrored, and the deviations say so.
+    assert float((error / std).max()) < 4.0
+    assert float(error.where(std < 0.2).max()) < 0.4
+    assert float((std < 0.2).mean()) > 0.85
 
 
 def test_known_emissivities_and_rapid_heating() -> None:

@@ -33,7 +33,7 @@ def picture() -> tuple[xr.Dataset, xr.Dataset]:
     return scene, simulation.observe(scene, RIG.response(), rng)
 
 
-@pytest.mark.parametrize("factor", [1.5, 2.0, 4.0])
+@pytest.mark.parametrize("factor", [1.15, 1.5, 2.0, 4.0])
 def test_too_small_a_noise_is_replaced(
     picture: tuple[xr.Dataset, xr.Dataset], factor: float
 ) -> None:

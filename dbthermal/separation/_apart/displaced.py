@@ -208,13 +208,12 @@ def paired(
     pixels = selected if resampled.packed is None else slice(None)
     first = capture["counts"].isel(band=displacement.reference, y=rows).values
     first, second = first.reshape(len(first), -1)[:, pixels], resampled.counts[..., pixels]
-    valid, lost = np.ones(first.shape, dtype=bool), quality.unusable(resampled.status[pixels])
+    valid, counts = np.ones(first.shape, dtype=bool), np.empty((bands, *first.shape))
+    counts[displacement.reference], counts[displacement.others] = first, second
+    counts[..., quality.unusable(resampled.status[pixels])] = 0.0
     if resampled.packed is not None:
         valid = np.unpackbits(resampled.packed, axis=0, count=len(first)).view(bool)
-    counts = np.empty((bands, *first.shape))
-    counts[displacement.reference], counts[displacement.others] = first, second
-    if lost.any() or resampled.packed is not None:
-        counts[:, ~valid | lost] = 0.0
+        counts[:, ~valid] = 0.0
     counts, usable = quality.bridge(counts, valid, capture["time"].values.astype(np.float64))
     if resampled.packed is not None:
         counts, usable, valid = counts[..., selected], usable[:, selected], valid[:, selected]

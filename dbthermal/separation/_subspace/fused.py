@@ -1,4 +1,4 @@
-"""Steps 1 to 4 of `method`, one pixel after another, compiled; `tensors` has them for a device."""
+"""Steps 1 to 4 of `method`, one pixel after another, compiled."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
