@@ -247,22 +247,24 @@ def test_the_demonstration_runs_as_it_is_printed(tmp_path: Path, option: list[st
     """At most five printed commands take its files to a report and the explorer, near the truth."""
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     assert "\ndbthermal demo try-it   # or --side-by-side\n" in readme
-    _, out, _ = said(tmp_path, "demo", "try-it", *option)
+    folder = tmp_path / ("try it" if option else "try-it")
+    _, out, _ = said(tmp_path, "demo", folder.name, *option)
+    assert f"\ncd {shlex.quote(folder.name)}\n" in out
     commands = [line for line in out.splitlines() if line.startswith("dbthermal ")]
     assert "simulated" in out
     assert len(commands) <= 5
-    assert len([*(tmp_path / "try-it").glob("*.tif")]) == 10
-    assert "There is something at" in refused(tmp_path, "demo", "try-it", *option)
+    assert len([*folder.glob("*.tif")]) == 10
+    assert "There is something at" in refused(tmp_path, "demo", folder.name, *option)
     texts = []
     for command in commands:
         with warnings.catch_warnings(action="always"):
-            status, out, error = said(tmp_path / "try-it", *shlex.split(command)[1:])
+            status, out, error = said(folder, *shlex.split(command)[1:])
         assert status == 0, error
         texts.append(out)
-    assert {"report.html", "look.ipynb"} <= {path.name for path in (tmp_path / "try-it").iterdir()}
-    result = store.open_dataset(tmp_path / "try-it" / "result.zarr")
+    assert {"report.html", "look.ipynb"} <= {path.name for path in folder.iterdir()}
+    result = store.open_dataset(folder / "result.zarr")
     assert result.attrs["origin"] == "simulated"  # as the stacks say by themselves
-    assert store.open_dataset(tmp_path / "try-it/response.zarr").attrs["origin"] == "simulated"
+    assert store.open_dataset(folder / "response.zarr").attrs["origin"] == "simulated"
     # The answer comes first, and holds the truth: 22 to 60 degC, a third of it measured or more.
     head = re.search(r"Object from (\S+) to (\S+) degC, typically \+- (\S+) K \(noise", texts[2])
     assert head, texts[2]
@@ -274,7 +276,7 @@ def test_the_demonstration_runs_as_it_is_printed(tmp_path: Path, option: list[st
     assert re.search(r"Emissivity at \d+ pixels, like .*plate window glass.*: 0\.8[56]", texts[2])
     assert "Watch out:" in texts[2]
     if option:  # displaced by the 2 rows and 4 columns, and 3 columns, that were put in
-        made = done(tmp_path / "try-it", "info", "result.zarr")["result.zarr"]
+        made = done(folder, "info", "result.zarr")["result.zarr"]
         np.testing.assert_allclose(made["view_shift_pixel"]["9.5"], [-2, -4], rtol=0, atol=0.2)
         assert abs(abs(made["reflection_shift_pixel"]["columns"]) - 3) < 0.2  # [pixel]
 
@@ -616,7 +618,9 @@ demo noise.tif -> There is something at 'noise.tif'. Must be new, or a folder.
 info noise.tif -> Damaged TIFF 'noise.tif': not a TIFF file: header=b'
 import folder --bands a b --clock 10 -o x.zarr -> Invalid folder .* Must be files: folder/
 info folder -> Invalid folder 'folder', no whole zarr. Must be files: folder/.*.tif
-info nothing.zarr -> No file or folder 'nothing.zarr'
+info nothing*.tif -> No file or folder 'nothing.*.tif'. Must exist, without '.'
+info 1714564800000.tif 1714564801000.tif 1714564802000.tif --clock 30
+ -> Warning: The dates of .* are 1 s apart, by --clock 0.0333 s. Must be
 plan gold --noise 0.03 -> Unknown material 'gold'
 export result.zarr -o out.xyz -> Must end in one of .'.csv', '.tif', '.nc', '.png'
 export result.zarr --pixel 1 1 -o curve.txt -> Must end in one of .'.csv'
@@ -684,6 +688,9 @@ def mistaken(results: Path) -> Path:
     mistakes = {"warm": warm, "cold": warm - np.uint16(9), "five": stack[:5], "few": stack[5:10]}
     for name, wrong in mistakes.items():
         tifffile.imwrite(results / f"{name}.tif", wrong, photometric="minisblack")
+    for second in range(3):  # since 1970 [ms]
+        name = f"171456480{second}000.tif"
+        tifffile.imwrite(results / name, stack[second], photometric="minisblack")
     (results / "noise.tif").write_bytes(bytes(range(50)))
     (results / "folder").mkdir()
     (results / "dangling").symlink_to("nowhere")

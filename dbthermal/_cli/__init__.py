@@ -84,7 +84,8 @@ def sources_and_targets(options: Namespace) -> tuple[list[Path], list[Path]]:
     targets = [value for name, value in arguments if name.endswith(("output", "folder")) and value]
     end = {"explore": ".ipynb", "report": ".html", "export": ""}.get(options.command, ".zarr")
     if missing := [path for path in sources if not path.exists()]:
-        raise FileNotFoundError(f"No file or folder '{missing[0]}'. Must exist.")
+        rule = "Must exist, without '*' or '~'"
+        raise FileNotFoundError(f"No file or folder '{missing[0]}'. {rule}.")
     taken = [source.resolve() for source in sources]
     for path in targets:
         place = path.resolve()

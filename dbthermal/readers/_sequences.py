@@ -2,6 +2,8 @@
 
 import re
 import sys
+from collections.abc import Iterable
+from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,6 +18,7 @@ from dbthermal.readers._recording import MEMORY, SMOOTHER, Clock, Counts
 
 _FIRST: Final = 8  # frames that tell rows from columns
 _LONGER: Final = 64  # factor of roughness between the parts of a longer number
+_SAMPLE: Final = 2**16  # numbers whose rows are compared
 _LONGEST: Final = 2**16  # header of an .sfmov, or its .inc [byte]
 # Header of a Telops frame: length [byte], rate [mHz], time [s] and its fraction [100 ns], and more.
 _HEADER: Final[np.dtype[Any]] = np.dtype(
@@ -99,18 +102,29 @@ def raw(
 def _other_height(counts: Counts) -> list[str]:
     """Sentence on images that are parts of a frame, or several: rows repeat at another distance."""
     height, rows = counts.shape[1], np.concatenate(counts[: 2 * _FIRST]).astype(np.int32)
+    rows = rows[:, :: 1 + rows.size // _SAMPLE]
+    parts = [height // n for n in (4, 3, 2) if height % n == 0]
+    period = _repetition(rows, [*parts, *range(height, 5 * height, height)])
+    # Another height by the pattern of the pixels: a gradient, as it warms, repeats at any.
+    period = period or _repetition(np.diff(rows, axis=1), range(height // 4, 4 * height))
+    said = f"Rows of images repeat after {period}, not {height}. Must be the height of a frame."
+    return [said] * (period not in {0, height})
 
+
+def _repetition(rows: npt.NDArray[Any], distances: Iterable[int]) -> int:
+    """First distance at which rows are alike, and not before and behind it; 0 if there is none."""
+
+    @cache
     def change(distance: int) -> float:
         """Median change from a row to the row at a distance below."""
         return float(np.median(np.abs(rows[distance:] - rows[:-distance])) + 0.5)
 
-    tried = [height // n for n in (4, 3, 2) if height % n == 0] + [n * height for n in range(1, 5)]
-    for n in (n for n in tried if 1 < n < len(rows) // 2):
+    for n in (n for n in distances if 1 < n < len(rows) // 2):
         aside = -(-n // 8)
-        if change(n) < min(change(n - aside), change(n + aside)) / SMOOTHER:
-            said = f"Rows of images repeat after {n}, not {height}. Must be the height of a frame."
-            return [said] * (n != height)
-    return []
+        near, far = (min(change(n - step), change(n + step)) for step in (1, aside))
+        if change(n) <= near and change(n) < far / SMOOTHER:
+            return n
+    return 0
 
 
 def _are_longer(counts: Counts) -> bool:

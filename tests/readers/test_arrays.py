@@ -397,7 +397,11 @@ def test_times_beside_frames(tmp_path: Path, name: str) -> None:
     ):
         with pytest.raises(ValueError, match=r"Invalid times of .* Must agree to half a frame"):
             read(hdf5(path, **{name: times}))
+    days = {name.removesuffix("_s"): 45000 + np.arange(3) / 864e3}  # as in tables
+    assert_array_equal(read(hdf5(path, **days)).counts, scene())
     assert_array_equal(read(hdf5(path, **{name: np.arange(9.0)})).counts, scene())
+    with pytest.raises(ValueError, match=rf"Invalid axes of 'frames' .* '{name}' has 32\. Must be"):
+        read(hdf5(path, **{name: np.arange(32.0)}))
     with pytest.raises(ValueError, match="Invalid times"):
         read(hdf5(path, **{f"other/{name}": np.arange(3.0)}))
     two = {f"other/{name}": np.arange(3.0), "other/frames": scene()}
