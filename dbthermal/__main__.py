@@ -287,10 +287,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     say = cache(lambda text: print(_shown(f"Warning: {text}"), file=sys.stderr))  # once
     options = argparse.Namespace()
     warnings.showwarning = lambda message, *_, **__: say(_with_options(str(message), options))
-    _parser().parse_args(arguments, options)
+    stated = [*_cli.expanded(sys.argv[1:] if arguments is None else arguments)]
+    _parser().parse_args(stated, options)
     # An error ends in a line and a status.
     try:
-        return _carry_out(options, sys.argv[1:] if arguments is None else arguments)
+        return _carry_out(options, stated)
     except BrokenPipeError:  # nobody reads the summary any more
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return 0

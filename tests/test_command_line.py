@@ -618,9 +618,9 @@ demo noise.tif -> There is something at 'noise.tif'. Must be new, or a folder.
 info noise.tif -> Damaged TIFF 'noise.tif': not a TIFF file: header=b'
 import folder --bands a b --clock 10 -o x.zarr -> Invalid folder .* Must be files: folder/
 info folder -> Invalid folder 'folder', no whole zarr. Must be files: folder/.*.tif
-info nothing*.tif -> No file or folder 'nothing.*.tif'. Must exist, without '.'
-info 1714564800000.tif 1714564801000.tif 1714564802000.tif --clock 30
- -> Warning: The dates of .* are 1 s apart, by --clock 0.0333 s. Must be
+info nothing*.zarr -> No file or folder 'nothing.*.zarr'
+info 1714*.tif --clock 30 -> Warning: The dates of .* are 1 s apart, by --clock 0.0333 s. Must be
+info part*.tif --clock 9 -> Warning: The numbers of 'part8.tif to part11.tif' leave out 1 frames
 plan gold --noise 0.03 -> Unknown material 'gold'
 export result.zarr -o out.xyz -> Must end in one of .'.csv', '.tif', '.nc', '.png'
 export result.zarr --pixel 1 1 -o curve.txt -> Must end in one of .'.csv'
@@ -688,9 +688,9 @@ def mistaken(results: Path) -> Path:
     mistakes = {"warm": warm, "cold": warm - np.uint16(9), "five": stack[:5], "few": stack[5:10]}
     for name, wrong in mistakes.items():
         tifffile.imwrite(results / f"{name}.tif", wrong, photometric="minisblack")
-    for second in range(3):  # since 1970 [ms]
-        name = f"171456480{second}000.tif"
-        tifffile.imwrite(results / name, stack[second], photometric="minisblack")
+    for place, number in enumerate((8, 9, 11)):
+        for name in (f"part{number}.tif", f"171456480{place}000.tif"):  # since 1970 [ms]
+            tifffile.imwrite(results / name, stack[place], photometric="minisblack")
     (results / "noise.tif").write_bytes(bytes(range(50)))
     (results / "folder").mkdir()
     (results / "dangling").symlink_to("nowhere")

@@ -8,7 +8,7 @@ import threading
 import time
 import warnings
 from argparse import ArgumentTypeError, Namespace
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from inspect import signature
 from pathlib import Path
@@ -28,6 +28,16 @@ _STAGES: Final = {  # modules -> what is done in them; the innermost of a thread
     "dbthermal.store": "reading or writing",
     "dbthermal.figures": "drawing",
 }
+
+
+def expanded(arguments: Sequence[str]) -> Iterator[str]:
+    """Yield arguments, in place of a pattern that no shell has expanded its files, by numbers."""
+    for argument in arguments:
+        path = Path(argument)
+        files = path.parent.glob(path.name) if "*" in path.name else ()
+        parted = [re.split("([0-9]+)", str(file)) for file in files]
+        parted.sort(key=lambda words: [*map(int, words[1::2]), *words])
+        yield from map("".join, parted or [[argument]])
 
 
 def leaves(value: Any) -> Iterator[Any]:
@@ -84,8 +94,7 @@ def sources_and_targets(options: Namespace) -> tuple[list[Path], list[Path]]:
     targets = [value for name, value in arguments if name.endswith(("output", "folder")) and value]
     end = {"explore": ".ipynb", "report": ".html", "export": ""}.get(options.command, ".zarr")
     if missing := [path for path in sources if not path.exists()]:
-        rule = "Must exist, without '*' or '~'"
-        raise FileNotFoundError(f"No file or folder '{missing[0]}'. {rule}.")
+        raise FileNotFoundError(f"No file or folder '{missing[0]}'. Must exist.")
     taken = [source.resolve() for source in sources]
     for path in targets:
         place = path.resolve()

@@ -26,15 +26,7 @@ from scipy.constants import zero_Celsius
 from dbthermal import schema
 from dbthermal._coordinates import laid_on
 from dbthermal.figures import drawing
-from dbthermal.figures.drawing import (
-    band_label,
-    canvas,
-    draw_image,
-    limits_of,
-    percent,
-    plain_decades,
-    provenance_note,
-)
+from dbthermal.figures.drawing import band_label, canvas, draw_image, limits_of
 
 __all__ = [
     "REASONS",
@@ -325,7 +317,7 @@ def plan(expected: xr.Dataset, durations: xr.Dataset, materials: Sequence[str]) 
     map_axis.set_xticks(range(len(names)), names, fontsize=8)
     map_axis.set_yticks(range(len(values)), std["material"].values.tolist(), fontsize=8)
     bar = figure.colorbar(drawn, ax=map_axis, label="expected std [K]", shrink=0.8, extend="both")
-    plain_decades(bar.ax)
+    drawing.plain_decades(bar.ax)
     map_axis.set_xlabel(f"filter beside {expected.attrs['beside']} [{_MICRO}]")
     # Lines of the materials over the length.
     best = expected["best"].sel(material=list(materials))
@@ -339,7 +331,7 @@ def plan(expected: xr.Dataset, durations: xr.Dataset, materials: Sequence[str]) 
             **drawing.marked_line(index),
         )
     drawing.plain_ticks(bar_axis, durations["seconds"])
-    plain_decades(bar_axis)
+    drawing.plain_decades(bar_axis)
     bar_axis.set(xlabel="length of the film [s]", ylabel="expected std [K]")
     if filtered.size:
         bar_axis.legend(frameon=False, fontsize=8, loc="upper right")
@@ -410,7 +402,7 @@ def status(result: xr.Dataset) -> Figure:
     legend_axis.set_axis_off()
     # Legend with shares.
     patches = [
-        Patch(facecolor=color, edgecolor="0.5", label=f"{percent(share)}  {words}")
+        Patch(facecolor=color, edgecolor="0.5", label=f"{drawing.percent(share)}  {words}")
         for words, color, share in shown
     ]
     legend_axis.legend(
@@ -418,9 +410,9 @@ def status(result: xr.Dataset) -> Figure:
     )
     shares = {words: share for words, _, share in shown}
     completed = sum(share for words, share in shares.items() if "completed" in words)
-    good = f"{percent(shares.get(_GOOD[0], 0.0))} of the pixels have no flag"
-    good += f", {percent(completed)} are completed" if completed else ""
-    figure.suptitle(f"Status: {good}{provenance_note(result)}", fontsize="medium")
+    good = f"{drawing.percent(shares.get(_GOOD[0], 0.0))} of the pixels have no flag"
+    good += f", {drawing.percent(completed)} are completed" if completed else ""
+    figure.suptitle(f"Status: {good}{drawing.provenance_note(result)}", fontsize="medium")
     return figure
 
 

@@ -2,14 +2,13 @@
 
 import re
 import sys
-from collections.abc import Iterable
-from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
+from scipy import fft
 
 from dbthermal import _numbers
 from dbthermal._arrays import Array
@@ -18,7 +17,6 @@ from dbthermal.readers._recording import MEMORY, SMOOTHER, Clock, Counts
 
 _FIRST: Final = 8  # frames that tell rows from columns
 _LONGER: Final = 64  # factor of roughness between the parts of a longer number
-_SAMPLE: Final = 2**16  # numbers whose rows are compared
 _LONGEST: Final = 2**16  # header of an .sfmov, or its .inc [byte]
 # Header of a Telops frame: length [byte], rate [mHz], time [s] and its fraction [100 ns], and more.
 _HEADER: Final[np.dtype[Any]] = np.dtype(
@@ -96,35 +94,34 @@ def raw(
         rule = "Must be rows, then columns"
         raise ValueError(f"Invalid shape {shape} of '{name}': rougher than {shape[::-1]}. {rule}.")
     decided = {"byte_order": byte_order, "byte_order_by": "caller"}
-    return _recording.clocked(counts, clock, name, *_other_height(counts), format="raw", **decided)
+    return _recording.clocked(counts, clock, name, *_other_size(counts), format="raw", **decided)
 
 
-def _other_height(counts: Counts) -> list[str]:
-    """Sentence on images that are parts of a frame, or several: rows repeat at another distance."""
+def _other_size(counts: Counts) -> list[str]:
+    """Sentence on images that are parts of a frame, or several: they repeat at another distance."""
     height, rows = counts.shape[1], np.concatenate(counts[: 2 * _FIRST]).astype(np.int32)
-    rows = rows[:, :: 1 + rows.size // _SAMPLE]
-    parts = [height // n for n in (4, 3, 2) if height % n == 0]
-    period = _repetition(rows, [*parts, *range(height, 5 * height, height)])
-    # Another height by the pattern of the pixels: a gradient, as it warms, repeats at any.
-    period = period or _repetition(np.diff(rows, axis=1), range(height // 4, 4 * height))
-    said = f"Rows of images repeat after {period}, not {height}. Must be the height of a frame."
-    return [said] * (period not in {0, height})
 
-
-def _repetition(rows: npt.NDArray[Any], distances: Iterable[int]) -> int:
-    """First distance at which rows are alike, and not before and behind it; 0 if there is none."""
-
-    @cache
     def change(distance: int) -> float:
         """Median change from a row to the row at a distance below."""
         return float(np.median(np.abs(rows[distance:] - rows[:-distance])) + 0.5)
 
-    for n in (n for n in distances if 1 < n < len(rows) // 2):
+    tried = [height // n for n in (4, 3, 2) if height % n == 0] + [n * height for n in range(1, 5)]
+    for n in (n for n in tried if 1 < n < len(rows) // 2):
         aside = -(-n // 8)
-        near, far = (min(change(n - step), change(n + step)) for step in (1, aside))
-        if change(n) <= near and change(n) < far / SMOOTHER:
-            return n
-    return 0
+        if change(n) < min(change(n - aside), change(n + aside)) / SMOOTHER:
+            said = f"Rows of images repeat after {n}, not {height}. Must be the height of a frame."
+            return [said] * (n != height)
+    # Any other size, by the autocorrelation of the pixels' pattern: a gradient repeats everywhere.
+    size, signs = counts[0].size, np.sign(np.diff(counts[:_FIRST].ravel().astype(np.int32)))
+    power = np.abs(fft.rfft(signs.astype(np.float32), fft.next_fast_len(2 * signs.size))) ** 2
+    alike = fft.irfft(power)[: signs.size // 2] / np.arange(signs.size, (signs.size + 1) // 2, -1)
+    likely = alike[size // 4 : -1] > 1.0 / SMOOTHER
+    period = size // 4 + int(np.argmax(likely))
+    if len(counts) < _FIRST or not likely.any():
+        return []
+    unlike = np.abs(alike[[period - 1, period + 1, size]]).max()
+    said = f"Numbers repeat after {period}, not {size}. Must be rows times columns of a frame."
+    return [said] * bool(alike[period] > SMOOTHER * unlike)
 
 
 def _are_longer(counts: Counts) -> bool:
