@@ -230,7 +230,7 @@ def test_info_of_stores_and_files(results: Path) -> None:
         file["counts"].dims[0].attach_scale(file["time"])
     assert done(results, "info", "timed.h5")["timed.h5"]["frame_rate_Hz"] == pytest.approx(10)
     one = done(results, "info", "a.tif", "--unit", "count", "--clock", "10")["a.tif"]
-    assert one["stage"] == "recording of one band"
+    assert one["stage"] == "recording"
     assert one["attributes"]["byte_order"] == "little"
     # Two cameras' files as the other commands name them, and two stores.
     for names in (["a.tif", "b.tif"], ["a.tif", "+", "b.tif"]):

@@ -10,23 +10,23 @@ HOUSE = Path(dbthermal.__file__).parent
 
 # Lines and modules that a room may have. A room that grows takes from another; these only fall.
 BUDGET = {
-    "": (3503, 18),
-    "_cli": (1256, 5),
+    "": (3508, 18),
+    "_cli": (1254, 5),
     "alignment": (2819, 10),
     "calibration": (793, 2),
     "correction": (1726, 6),
     "emissivity": (421, 1),
-    "explorer": (1265, 6),
+    "explorer": (1264, 6),
     "figures": (579, 2),
     "instruments": (5345, 19),
     "limits": (713, 3),
-    "readers": (2671, 10),
+    "readers": (2663, 10),
     "reporting": (392, 1),
     "separation": (12861, 54),
     "simulation": (563, 2),
     "store": (1376, 6),
 }
-INSTALLED = 36_283  # lines of all rooms
+INSTALLED = 36_277  # lines of all rooms
 
 PRONOUNS = {
     *("one", "other", "others", "own", "part", "parts", "some", "here", "there", "told", "known"),

@@ -280,11 +280,9 @@ def recording(
     late = np.diff(exposed[stamped]) > _GAP * period * np.diff(stamped)
     flags[stamped[1:][late]] |= FileFlag.FRAMES_LOST_BEFORE.value
     # The dataset, with a clock without holes.
-    variables = {
-        "counts": (("time", "y", "x"), counts, schema.STAGES["capture"]["counts"].attrs),
-        "exposure_time": ("time", exposed - exposed[stamped[0]], schema.EXPOSURE_TIME.attrs),
-        "frame_flags": ("time", flags, FileFlag.cf_attrs(schema.FRAME_FLAGS)),
-    }
+    values = {"counts": counts, "exposure_time": exposed - exposed[stamped[0]]}
+    variables = schema.variables("recording", values)
+    variables["frame_flags"] = "time", flags, FileFlag.cf_attrs(schema.FRAME_FLAGS)
     slots = np.arange(exposed.size)  # unknown times on the line between their neighbours
     outside = slots - np.clip(slots, stamped[0], stamped[-1])
     time = np.interp(slots, stamped, exposed[stamped]) + period * outside

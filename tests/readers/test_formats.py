@@ -33,7 +33,7 @@ def test_commands_read_by_first_bytes(tmp_path: Path, capsys: pytest.CaptureFixt
     for name in ("a.hdf", "a.dat", "a1.bin"):
         status, text = info(capsys, tmp_path / name, *STATED)
         assert status == 0, text
-        assert "recording of one band" in text
+        assert "stage: recording" in text
     (tmp_path / "b.bin").write_bytes(sequence(scene()))
     assert info(capsys, tmp_path / "b.bin")[0] == 0
 
