@@ -620,7 +620,7 @@ import folder --bands a b --clock 10 -o x.zarr -> Invalid folder .* Must be file
 info folder -> Invalid folder 'folder', no whole zarr. Must be files: folder/.*.tif
 info nothing*.zarr -> No file or folder 'nothing.*.zarr'
 info 1714*.tif --clock 30 -> Warning: The dates of .* are 1 s apart, by --clock 0.0333 s. Must be
-info part*.tif --clock 9 -> Warning: The numbers of 'part8.tif to part11.tif' leave out 1 frames
+info gap*.tif --clock 9 -> Warning: The numbers of 'gap8.tif to gap11.tif' leave out 1 frames
 plan gold --noise 0.03 -> Unknown material 'gold'
 export result.zarr -o out.xyz -> Must end in one of .'.csv', '.tif', '.nc', '.png'
 export result.zarr --pixel 1 1 -o curve.txt -> Must end in one of .'.csv'
@@ -689,7 +689,7 @@ def mistaken(results: Path) -> Path:
     for name, wrong in mistakes.items():
         tifffile.imwrite(results / f"{name}.tif", wrong, photometric="minisblack")
     for place, number in enumerate((8, 9, 11)):
-        for name in (f"part{number}.tif", f"171456480{place}000.tif"):  # since 1970 [ms]
+        for name in (f"gap{number}.tif", f"171456480{place}000.tif"):  # since 1970 [ms]
             tifffile.imwrite(results / name, stack[place], photometric="minisblack")
     (results / "noise.tif").write_bytes(bytes(range(50)))
     (results / "folder").mkdir()
