@@ -287,11 +287,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     say = cache(lambda text: print(_shown(f"Warning: {text}"), file=sys.stderr))  # once
     options = argparse.Namespace()
     warnings.showwarning = lambda message, *_, **__: say(_with_options(str(message), options))
-    stated = [*_cli.expanded(sys.argv[1:] if arguments is None else arguments)]
-    _parser().parse_args(stated, options)
+    _parser().parse_args(arguments, options)
     # An error ends in a line and a status.
     try:
-        return _carry_out(options, stated)
+        return _carry_out(options, sys.argv[1:] if arguments is None else arguments)
     except BrokenPipeError:  # nobody reads the summary any more
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return 0
@@ -340,6 +339,8 @@ def _carry_out(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     module, function = options.place.split(".")
     if options.command == "record":
         return int(_command(module, function)(options))
+    for name in {"files", "at"} & vars(options).keys():
+        setattr(options, name, _cli.expanded(getattr(options, name)))
     with _cli.stage_shown(options.command):
         _command("files", "refuse_unused")(options, arguments)
         sources, targets = _cli.sources_and_targets(options)

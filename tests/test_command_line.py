@@ -613,6 +613,7 @@ separate scene.zarr response.zarr --correction nuc.zarr --corrected-by-camera -o
 {EXCHANGED} -> Warning: Counts of bands .* are files of the bands exchanged
 calibrate --at 5C --clock 10 -o x.zarr -> Invalid 0 files
 calibrate -o x.zarr -> Missing source. Must be one of --at, --blackbody
+calibrate --at 5C a5.tif + b5.tif --bands a b --clock 9 -o x.zarr -> Invalid blackbody frames of 1
 demo x --side -> unrecognized arguments: --side Did you mean '--side-by-side'
 demo noise.tif -> There is something at 'noise.tif'. Must be new, or a folder.
 info noise.tif -> Damaged TIFF 'noise.tif': not a TIFF file: header=b'

@@ -8,7 +8,7 @@ import threading
 import time
 import warnings
 from argparse import ArgumentTypeError, Namespace
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from inspect import signature
 from pathlib import Path
@@ -30,14 +30,17 @@ _STAGES: Final = {  # modules -> what is done in them; the innermost of a thread
 }
 
 
-def expanded(arguments: Sequence[str]) -> Iterator[str]:
-    """Yield arguments, in place of a pattern that no shell has expanded its files, by numbers."""
-    for argument in arguments:
-        path = Path(argument)
-        files = path.parent.glob(path.name) if "*" in path.name else ()
+def expanded(values: list[Any]) -> list[Any]:
+    """Values of an argument, in place of a pattern that no shell expanded its files by numbers."""
+    result = list[Any]()
+    for value in values:
+        is_pattern = isinstance(value, Path) and "*" in value.name
+        files = value.parent.glob(value.name) if is_pattern else ()
         parted = [re.split("([0-9]+)", str(file)) for file in files]
         parted.sort(key=lambda words: [*map(int, words[1::2]), *words])
-        yield from map("".join, parted or [[argument]])
+        listed = [expanded(value)] if isinstance(value, list) else [value]
+        result += [Path("".join(words)) for words in parted] or listed
+    return result
 
 
 def leaves(value: Any) -> Iterator[Any]:
@@ -83,7 +86,7 @@ def kelvin(text: str) -> float:
 
 def kelvin_or_path(text: str) -> float | Path:
     """Temperature, or the path of a file."""
-    form = r"[-+\N{MINUS SIGN}\N{EN DASH}\d.,]+ ?(deg\w* ?)?\W?[A-Za-z]?"
+    form = r"[-+\N{MINUS SIGN}\N{EN DASH}\d.,]*\d[.,]? ?(deg\w* ?)?\W?[A-Za-z]?"
     return kelvin(text) if re.fullmatch(form, text) else Path(text)
 
 
