@@ -285,8 +285,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # A program may be started without a terminal.
     sys.stdout, sys.stderr = sys.stdout or StringIO(), sys.stderr or StringIO()
     say = cache(lambda text: print(_shown(f"Warning: {text}"), file=sys.stderr))  # once
-    warnings.showwarning = lambda message, *_, **__: say(str(message))
-    options = _parser().parse_args(arguments)
+    options = argparse.Namespace()
+    warnings.showwarning = lambda message, *_, **__: say(_with_options(str(message), options))
+    _parser().parse_args(arguments, options)
     # An error ends in a line and a status.
     try:
         return _carry_out(options, sys.argv[1:] if arguments is None else arguments)
@@ -298,13 +299,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:
         if options.traceback:
             raise
-        status, reason = 1, _reason(error, options)
-        for name in vars(options):  # an argument of Python is named as the option is
-            reason = re.sub(f" {name}=(?!b') ?", f" --{name.replace('_', '-')} ", reason)
+        status, reason = 1, _with_options(_reason(error, options), options)
         reason = re.sub(r"--frames slice\((\d+), (\d+)(?:, \d+)?\)", r"--frames \1 \2", reason)
         reason += _cli.suggestion(reason)
     print(_shown(f"dbthermal {options.command}: {reason}"), file=sys.stderr)
     return status
+
+
+def _with_options(text: str, options: argparse.Namespace) -> str:
+    """Message in which an argument of Python is named as the option is."""
+    for name in vars(options):
+        text = re.sub(f" {name}=(?!b') ?", f" --{name.replace('_', '-')} ", text)
+    return text
 
 
 def _reason(error: Exception, options: argparse.Namespace) -> str:
@@ -333,6 +339,8 @@ def _carry_out(options: argparse.Namespace, arguments: Sequence[str]) -> int:
     module, function = options.place.split(".")
     if options.command == "record":
         return int(_command(module, function)(options))
+    for name in {"files", "at"} & vars(options).keys():
+        setattr(options, name, _cli.expanded(getattr(options, name)))
     with _cli.stage_shown(options.command):
         _command("files", "refuse_unused")(options, arguments)
         sources, targets = _cli.sources_and_targets(options)

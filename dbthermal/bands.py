@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from dbthermal import _numbers, planck
+from dbthermal import _numbers, _text, planck
 from dbthermal._arrays import Array
 
 __all__ = ["FILTERS", "TEMPERATURE_RANGE", "Band", "get"]
@@ -144,6 +144,5 @@ def get(name: str) -> Band:
     >>> round(float(radiance), 4), round(float(band.temperature(radiance)), 6)
     (4.97, 300.0)
     """
-    if name not in FILTERS:
-        raise KeyError(f"Unknown band '{name}'. Must be one of {sorted(FILTERS)}.")
+    _text.check_listed("Unknown band", name, sorted(FILTERS), KeyError)
     return FILTERS[name]

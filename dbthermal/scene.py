@@ -12,7 +12,7 @@ from typing import Any, Final, Literal
 
 import xarray as xr
 
-from dbthermal import _rows, schema, store
+from dbthermal import _rows, _text, schema, store
 from dbthermal import response as responses
 from dbthermal._arrays import made_on_disk, on_disk
 from dbthermal.alignment import _joint, align, register
@@ -151,8 +151,7 @@ def _check_options(step: Callable[..., Any], options: Any) -> None:
     by_name = [it for it in signature(step).parameters.values() if it.kind is it.KEYWORD_ONLY]
     names = [it.name for it in by_name if it.name not in hidden]
     for option in options:
-        if option not in names:
-            raise TypeError(f"Unknown option {option!r} of '{name}'. Must be one of {names}.")
+        _text.check_listed(f"Unknown option of '{name}'", option, names, TypeError)
 
 
 def _aligned(

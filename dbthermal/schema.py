@@ -129,6 +129,7 @@ STATUS: Final = _of("y x", "1", "validity flags, 0 is good", "uint32")
 
 STAGES: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
     {
+        "recording": {"counts": _of("time y x", "count", "raw signal of one camera", "uint16")},
         "capture": {"counts": _of("band time y x", "count", "raw signal", "uint16")},
         "corrected": {"counts": _of("band time y x", "count", "corrected signal", "float32")},
         "reflection_shift": {
@@ -185,6 +186,10 @@ STAGES: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
 
 OPTIONAL: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
     {
+        "recording": {
+            "exposure_time": _of("time", "s", "when the frame was exposed"),
+            "frame_flags": _of("time", "1", "flags of the frame, 0 is good", "uint16"),
+        },
         "capture": {"exposure_time": EXPOSURE_TIME, "frame_flags": FRAME_FLAGS},
         "corrected": {
             "exposure_time": EXPOSURE_TIME,

@@ -230,7 +230,7 @@ def test_info_of_stores_and_files(results: Path) -> None:
         file["counts"].dims[0].attach_scale(file["time"])
     assert done(results, "info", "timed.h5")["timed.h5"]["frame_rate_Hz"] == pytest.approx(10)
     one = done(results, "info", "a.tif", "--unit", "count", "--clock", "10")["a.tif"]
-    assert one["stage"] == "recording of one band"
+    assert one["stage"] == "recording"
     assert one["attributes"]["byte_order"] == "little"
     # Two cameras' files as the other commands name them, and two stores.
     for names in (["a.tif", "b.tif"], ["a.tif", "+", "b.tif"]):
@@ -247,22 +247,24 @@ def test_the_demonstration_runs_as_it_is_printed(tmp_path: Path, option: list[st
     """At most five printed commands take its files to a report and the explorer, near the truth."""
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     assert "\ndbthermal demo try-it   # or --side-by-side\n" in readme
-    _, out, _ = said(tmp_path, "demo", "try-it", *option)
+    folder = tmp_path / ("try it" if option else "try-it")
+    _, out, _ = said(tmp_path, "demo", folder.name, *option)
+    assert f"\ncd {shlex.quote(folder.name)}\n" in out
     commands = [line for line in out.splitlines() if line.startswith("dbthermal ")]
     assert "simulated" in out
     assert len(commands) <= 5
-    assert len([*(tmp_path / "try-it").glob("*.tif")]) == 10
-    assert "There is something at" in refused(tmp_path, "demo", "try-it", *option)
+    assert len([*folder.glob("*.tif")]) == 10
+    assert "There is something at" in refused(tmp_path, "demo", folder.name, *option)
     texts = []
     for command in commands:
         with warnings.catch_warnings(action="always"):
-            status, out, error = said(tmp_path / "try-it", *shlex.split(command)[1:])
+            status, out, error = said(folder, *shlex.split(command)[1:])
         assert status == 0, error
         texts.append(out)
-    assert {"report.html", "look.ipynb"} <= {path.name for path in (tmp_path / "try-it").iterdir()}
-    result = store.open_dataset(tmp_path / "try-it" / "result.zarr")
+    assert {"report.html", "look.ipynb"} <= {path.name for path in folder.iterdir()}
+    result = store.open_dataset(folder / "result.zarr")
     assert result.attrs["origin"] == "simulated"  # as the stacks say by themselves
-    assert store.open_dataset(tmp_path / "try-it/response.zarr").attrs["origin"] == "simulated"
+    assert store.open_dataset(folder / "response.zarr").attrs["origin"] == "simulated"
     # The answer comes first, and holds the truth: 22 to 60 degC, a third of it measured or more.
     head = re.search(r"Object from (\S+) to (\S+) degC, typically \+- (\S+) K \(noise", texts[2])
     assert head, texts[2]
@@ -274,7 +276,7 @@ def test_the_demonstration_runs_as_it_is_printed(tmp_path: Path, option: list[st
     assert re.search(r"Emissivity at \d+ pixels, like .*plate window glass.*: 0\.8[56]", texts[2])
     assert "Watch out:" in texts[2]
     if option:  # displaced by the 2 rows and 4 columns, and 3 columns, that were put in
-        made = done(tmp_path / "try-it", "info", "result.zarr")["result.zarr"]
+        made = done(folder, "info", "result.zarr")["result.zarr"]
         np.testing.assert_allclose(made["view_shift_pixel"]["9.5"], [-2, -4], rtol=0, atol=0.2)
         assert abs(abs(made["reflection_shift_pixel"]["columns"]) - 3) < 0.2  # [pixel]
 
@@ -611,12 +613,15 @@ separate scene.zarr response.zarr --correction nuc.zarr --corrected-by-camera -o
 {EXCHANGED} -> Warning: Counts of bands .* are files of the bands exchanged
 calibrate --at 5C --clock 10 -o x.zarr -> Invalid 0 files
 calibrate -o x.zarr -> Missing source. Must be one of --at, --blackbody
+calibrate --at 5C a5.tif + b5.tif --bands a b --clock 9 -o x.zarr -> Invalid blackbody frames of 1
 demo x --side -> unrecognized arguments: --side Did you mean '--side-by-side'
 demo noise.tif -> There is something at 'noise.tif'. Must be new, or a folder.
 info noise.tif -> Damaged TIFF 'noise.tif': not a TIFF file: header=b'
 import folder --bands a b --clock 10 -o x.zarr -> Invalid folder .* Must be files: folder/
 info folder -> Invalid folder 'folder', no whole zarr. Must be files: folder/.*.tif
-info nothing.zarr -> No file or folder 'nothing.zarr'
+info nothing*.zarr -> No file or folder 'nothing.*.zarr'
+info 1714*.tif --clock 30 -> Warning: The dates of .* are 1 s apart, by --clock 0.0333 s. Must be
+info gap*.tif --clock 9 -> Warning: The numbers of 'gap8.tif to gap11.tif' leave out 1 frames
 plan gold --noise 0.03 -> Unknown material 'gold'
 export result.zarr -o out.xyz -> Must end in one of .'.csv', '.tif', '.nc', '.png'
 export result.zarr --pixel 1 1 -o curve.txt -> Must end in one of .'.csv'
@@ -684,6 +689,9 @@ def mistaken(results: Path) -> Path:
     mistakes = {"warm": warm, "cold": warm - np.uint16(9), "five": stack[:5], "few": stack[5:10]}
     for name, wrong in mistakes.items():
         tifffile.imwrite(results / f"{name}.tif", wrong, photometric="minisblack")
+    for place, number in enumerate((8, 9, 11)):
+        for name in (f"gap{number}.tif", f"171456480{place}000.tif"):  # since 1970 [ms]
+            tifffile.imwrite(results / name, stack[place], photometric="minisblack")
     (results / "noise.tif").write_bytes(bytes(range(50)))
     (results / "folder").mkdir()
     (results / "dangling").symlink_to("nowhere")

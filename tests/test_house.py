@@ -10,23 +10,23 @@ HOUSE = Path(dbthermal.__file__).parent
 
 # Lines and modules that a room may have. A room that grows takes from another; these only fall.
 BUDGET = {
-    "": (3502, 18),
-    "_cli": (1244, 5),
+    "": (3509, 18),
+    "_cli": (1257, 5),
     "alignment": (2819, 10),
     "calibration": (793, 2),
     "correction": (1726, 6),
     "emissivity": (421, 1),
-    "explorer": (1268, 6),
-    "figures": (595, 3),
+    "explorer": (1264, 6),
+    "figures": (579, 2),
     "instruments": (5345, 19),
     "limits": (713, 3),
-    "readers": (2670, 12),
-    "reporting": (393, 1),
+    "readers": (2663, 10),
+    "reporting": (392, 1),
     "separation": (12861, 54),
-    "simulation": (564, 2),
+    "simulation": (563, 2),
     "store": (1376, 6),
 }
-INSTALLED = 36_290  # lines of all rooms
+INSTALLED = 36_281  # lines of all rooms
 
 PRONOUNS = {
     *("one", "other", "others", "own", "part", "parts", "some", "here", "there", "told", "known"),

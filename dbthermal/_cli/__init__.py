@@ -30,6 +30,19 @@ _STAGES: Final = {  # modules -> what is done in them; the innermost of a thread
 }
 
 
+def expanded(values: list[Any]) -> list[Any]:
+    """Values of an argument, in place of a pattern that no shell expanded its files by numbers."""
+    result = list[Any]()
+    for value in values:
+        is_pattern = isinstance(value, Path) and "*" in value.name
+        files = value.parent.glob(value.name) if is_pattern else ()
+        parted = [re.split("([0-9]+)", str(file)) for file in files]
+        parted.sort(key=lambda words: [*map(int, words[1::2]), *words])
+        listed = [expanded(value)] if isinstance(value, list) else [value]
+        result += [Path("".join(words)) for words in parted] or listed
+    return result
+
+
 def leaves(value: Any) -> Iterator[Any]:
     """Yield the values of an argument, whose lists may hold lists."""
     for entry in value if isinstance(value, list) else [value]:
@@ -73,7 +86,7 @@ def kelvin(text: str) -> float:
 
 def kelvin_or_path(text: str) -> float | Path:
     """Temperature, or the path of a file."""
-    form = r"[-+\N{MINUS SIGN}\N{EN DASH}\d.,]+ ?(deg\w* ?)?\W?[A-Za-z]?"
+    form = r"[-+\N{MINUS SIGN}\N{EN DASH}\d.,]*\d[.,]? ?(deg\w* ?)?\W?[A-Za-z]?"
     return kelvin(text) if re.fullmatch(form, text) else Path(text)
 
 

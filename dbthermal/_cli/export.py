@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from datetime import datetime
 from importlib.util import find_spec
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import numpy as np
@@ -183,7 +184,7 @@ def explore(options: argparse.Namespace) -> dict[str, Any]:
         draft.write_text(json.dumps(notebook | {"nbformat_minor": 5}), encoding="utf-8")
     lacks = any(find_spec(library) is None for library in ("anywidget", "jupyterlab"))
     install = ", in a clone: python -m pip install '.[explorer]' jupyterlab; then" if lacks else ""
-    return {str(options.output): f"opened by{install}: jupyter lab {options.output}"}
+    return {str(options.output): f"opened by{install}: jupyter lab {quote(str(options.output))}"}
 
 
 _EXTREMES = ("minimum", "maximum")  # of the pixels of a region

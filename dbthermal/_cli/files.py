@@ -375,8 +375,6 @@ def summary(dataset: xr.Dataset, *, everything: bool = False) -> dict[str, Any]:
 
 def stage_of(dataset: xr.Dataset) -> str:
     """Stage of `schema` that a dataset fits, "other" if none."""
-    if "counts" in dataset and dataset["counts"].dims == ("time", "y", "x"):
-        return "recording of one band"
     fitting = ["other"]
     for stage, variables in sorted(schema.STAGES.items(), key=lambda stage: len(stage[1])):
         with suppress(TypeError, ValueError):

@@ -6,6 +6,7 @@ import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from shlex import quote
 from typing import Any, Final
 
 import numpy as np
@@ -78,8 +79,8 @@ def demo(options: argparse.Namespace) -> dict[str, Any]:
             tifffile.imwrite(draft, stack, photometric="minisblack", description=about)
     sweep = " ".join(f"--at {step}C a{step}.tif b{step}.tif" for step in _CELSIUS)
     views = " --register translation" if options.side_by_side else " --register none --offset 0"
-    commands = _NEXT.format(sweep=sweep, views=views).splitlines()
-    return {str(folder): f"{len(paths)} TIFF stacks, {_SCENE}", "next": [f"cd {folder}", *commands]}
+    commands = [f"cd {quote(str(folder))}", *_NEXT.format(sweep=sweep, views=views).splitlines()]
+    return {str(folder): f"{len(paths)} TIFF stacks, {_SCENE}", "next": commands}
 
 
 def _demo_stacks(rig: simulation.Rig, rng: np.random.Generator, *, apart: bool) -> dict[str, Any]:

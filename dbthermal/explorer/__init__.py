@@ -54,8 +54,7 @@ def explore(
     Parameters
     ----------
     data : Dataset, str or Path
-        Result of `separation`, or a capture; or the store of one, which is copied when it is first
-        shown (see `View`).
+        Result of `separation`, or a capture, or the store of one; see `View`.
     capture : Dataset, str or Path, optional
         Capture that the result was made of: its bands are shown beside it.
     response : Dataset, str or Path, optional

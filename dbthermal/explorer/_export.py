@@ -17,8 +17,7 @@ from PIL import Image
 from dbthermal import figures, store
 from dbthermal.explorer._films import Region
 from dbthermal.explorer._view import Pixels, View
-from dbthermal.figures import drawing
-from dbthermal.figures._maps import legend
+from dbthermal.figures import drawing, legend
 
 ANIMATED: Final = (".gif", ".webp")
 SUFFIXES: Final = (".csv", ".tiff", ".png", ".nc", *ANIMATED)

@@ -31,7 +31,6 @@ _LEAST_PAIRS: Final = 12  # pairs of neighbours that give the share of independe
 _LARGEST_SHARE: Final = 2.0  # of independent errors in the variance; beyond, the material differs
 _FEW: Final = 4  # parts of the image, of which one is copied by itself
 _LEAST: Final = {"rectangle": (2, 2), "ellipse": (2, 2), "polygon": (3, 1000)}
-_ONE_BAND: Final = schema.Variable(("time", "y", "x"), "uint16", "count", "raw signal")
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +140,7 @@ def input_panes(
 ) -> Iterator[Pane]:
     """Yield the bands of a capture, as apparent temperatures if there is a response."""
     if "counts" in capture and "band" not in capture["counts"].dims:  # of one camera
-        schema.check_variable(capture["counts"], _ONE_BAND, "'counts' of the capture")
+        schema.check(capture, "recording", ("counts",), "the capture")
         yield Pane("input", "input", "count", capture["counts"])
         return
     counts = schema.check(capture, "capture")["counts"]

@@ -18,8 +18,7 @@ from dbthermal._arrays import Mask
 from dbthermal.explorer import _export
 from dbthermal.explorer._films import FILMS, Region, Values
 from dbthermal.explorer._view import COMPLETED, View
-from dbthermal.figures import drawing
-from dbthermal.figures._maps import legend
+from dbthermal.figures import drawing, legend
 
 PALETTES: Final = ("inferno", "cividis", "gray", "gnuplot2", "turbo")
 _DPI: Final = 80

@@ -1,7 +1,17 @@
-"""Recordings of FLIR's cameras: counts, clock, and what the camera's record says."""
+"""Recordings of FLIR's cameras: counts, clock, and what the camera's record says.
 
+A file has records, found by their directory, never by their mark. A frame is a header of 64 bytes
+(mark, maker of the file, at 20 the version, whose size tells the byte order, at 24 place and length
+of the directory), a directory of 32 bytes a record (type, subtype, version, number, at 12 offset
+and length, at 28 a CRC-32, 0 for none) and the records. Frames follow one another, zeros between.
+In a JPEG they lie in the joined APP1 segments that begin with ``FLIR``. Read from files, and from
+the table of P. Harvey's ExifTool (FLIR.pm).
+"""
+
+import re
 import struct
-from collections.abc import Iterator, Sequence
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from datetime import UTC, datetime
 from itertools import islice
@@ -17,11 +27,18 @@ from dbthermal import _numbers
 from dbthermal import _text as texts
 from dbthermal._arrays import Array, Mask, empty, release
 from dbthermal._warnings import warned
-from dbthermal.readers import _flir_records, _formats, _recording
-from dbthermal.readers._flir_records import Content, Frame
+from dbthermal.readers import _formats, _recording
 from dbthermal.readers._formats import Paths
 from dbthermal.readers._recording import MEMORY, Clock, Counts, FileFlag
 
+_IMAGE, _CAMERA = 1, 32  # types of records
+_MARKS: Final = (b"FFF\0", b"AFF\0")
+_HEADER, _ENTRY = 64, 32  # sizes [byte]
+_MOST_RECORDS: Final = 1024  # in a frame; the files at hand have up to 14
+_PADDING: Final = 32  # by which the last record of a file may seem to pass its end [byte]
+_ALIGNED: Final = 4  # to a multiple of which some cameras fill up [byte]
+_SEGMENT: Final = b"FLIR\0\x01"
+_NO_ZERO: Final = re.compile(rb"[^\0]")
 _FIELDS: Final = {  # place in the camera's record [byte], type, and limits of plausible values
     "emissivity": (0x20, "f", 0.01, 1.0),
     "object_distance": (0x24, "f", 0.0, 1e4),
@@ -57,6 +74,20 @@ _IMAGE_SIZE: Final = 32  # of what precedes the counts
 _NUMBER: Final = 24  # place of the frame's number, in image and camera
 _FIRST_CLOCK: Final = datetime(2001, 1, 1, tzinfo=UTC).timestamp()  # clocks never set begin before
 _CONSTANTS: Final = ("planck_R1", "planck_R2", "planck_B", "planck_F", "planck_O")
+
+
+_Content = bytes | mmap
+
+
+class _Record(NamedTuple):
+    """Place of a record in its file [byte], and its CRC-32, 0 for none."""
+
+    start: int
+    stop: int
+    checksum: int
+
+
+_Frame = Mapping[int, _Record]  # record by its type
 
 
 class _Image(NamedTuple):
@@ -169,20 +200,20 @@ def flir(
     return warned(made, *(f"Wrong {note}: has it been edited?" for note in doubts[:1]))
 
 
-_Found = tuple[Content, Frame, str]
+_Found = tuple[_Content, _Frame, str]
 
 
 def _walk(paths: Sequence[Path], memory: float, stack: ExitStack) -> Iterator[_Found]:
     """Yield content, records and name of each frame of some files."""
     for path in paths:
         file = stack.enter_context(path.open("rb"))
-        content: Content = stack.enter_context(mmap(file.fileno(), 0, access=ACCESS_READ))
+        content: _Content = stack.enter_context(mmap(file.fileno(), 0, access=ACCESS_READ))
         if still := content[:2] == b"\xff\xd8":
             texts.regular_file(path, int(memory))
-            content = _flir_records.of_jpeg(content, path.name)
+            content = _of_jpeg(content, path.name)
         number = 0
         try:
-            for records in _flir_records.frames(content, path.name, still=still):
+            for records in _records(content, path.name, still=still):
                 yield content, records, f"frame {number} of '{path.name}'"
                 number += 1
         except ValueError as error:
@@ -190,9 +221,9 @@ def _walk(paths: Sequence[Path], memory: float, stack: ExitStack) -> Iterator[_F
             raise ValueError(f"{error}{before}") from error
 
 
-def _image(content: Content, records: Frame, place: str, stated: str) -> _Image:
+def _image(content: _Content, records: _Frame, place: str, stated: str) -> _Image:
     """Form and bytes of an image, of a stated byte order, whose sizes agree wherever they are."""
-    body, fault = _flir_records.body(content, records[_flir_records.IMAGE])
+    body, fault = _checked(content, records[_IMAGE])
     if fault:
         raise ValueError(f"Damaged image in {place}: {fault}.")
     head, body = body[:_IMAGE_SIZE], body[_IMAGE_SIZE:]
@@ -222,7 +253,7 @@ def _jpegls_size(body: bytes, place: str) -> tuple[int, int, int]:
     """Height, width and bits that a JPEG-LS image states, which must be whole."""
     if not body.rstrip(b"\0").endswith(b"\xff\xd9"):
         raise ValueError(f"Truncated image in {place}: no end of JPEG. Must be whole.")
-    for marker, start, _ in _flir_records.segments(body, place):
+    for marker, start, _ in _segments(body, place):
         if marker == 0xF7:
             bits, height, width, _ = struct.unpack_from(">BHHB", body, start)
             return height, width, bits
@@ -253,10 +284,10 @@ def _cameras(listed: Sequence[_Found], *, timed: bool) -> tuple[Array, Mask, dic
     milliseconds, first = np.full(len(listed), np.nan), dict[str, Any]()
     numbers, doubts = np.zeros((len(listed), 3), dtype=np.int64), dict[int, str]()
     for number, (content, records, place) in enumerate(listed):
-        if _flir_records.CAMERA not in records:
+        if _CAMERA not in records:
             continue
         # The record, in its byte order.
-        body, fault = _flir_records.body(content, records[_flir_records.CAMERA])
+        body, fault = _checked(content, records[_CAMERA])
         if fault:
             doubts[number] = f"checksum of the camera's record in {place}, {fault}"
         if len(body) < _CAMERA_SIZE or body[:2] not in {b"\2\0", b"\0\2"}:
@@ -267,7 +298,7 @@ def _cameras(listed: Sequence[_Found], *, timed: bool) -> tuple[Array, Mask, dic
             raise ValueError(f"Damaged {label}. {rule}.")
         order = "<" if body[0] else ">"
         # Numbers and time of the frame.
-        start = records[_flir_records.IMAGE].start
+        start = records[_IMAGE].start
         image = "<" if content[start] else ">"
         (of_image,) = struct.unpack_from(f"{image}H", content, start + _NUMBER)
         (of_camera,) = struct.unpack_from(f"{order}H", body, _NUMBER)
@@ -330,3 +361,106 @@ def _attrs(camera: dict[str, Any], seconds: float | None = None) -> dict[str, An
         if seconds < _FIRST_CLOCK:
             implausible.append(f"date {moment:%Y-%m-%d}, as of a clock that was never set")
     return {"implausible": "; ".join(implausible), **attrs}
+
+
+def _records(content: _Content, name: str, *, still: bool) -> Iterator[_Frame]:
+    """Yield the records of each frame of a file; ValueError by frame and byte where damaged."""
+    at: int | None = 0
+    number = 0
+    while at is not None:
+        records, stop = _frame(content, at, f"frame {number} of '{name}', at byte {at}")
+        yield records
+        at, number = _following(content, at, stop, still=still), number + 1
+
+
+def _following(content: _Content, start: int, stop: int, *, still: bool) -> int | None:
+    """Place of the frame behind a frame from start to stop; None at the end of the file."""
+    # Behind the last record lie zeros, or bytes that fill the frame up to a multiple of 4.
+    filled = start + -(-(stop - start) // _ALIGNED) * _ALIGNED
+    for behind in (stop, filled):
+        if (byte := _NO_ZERO.search(content, behind)) is None:
+            return None
+        at, head = byte.start(), content[byte.start() : byte.start() + _HEADER]
+        if any(mark.startswith(head[: len(mark)]) for mark in _MARKS):
+            return at
+    return None if still or len(head) < _HEADER else at  # a still has one frame, then filling
+
+
+def _checked(content: _Content, record: _Record) -> tuple[bytes, str]:
+    """Bytes of a record, and a sentence on its checksum if that is wrong."""
+    value = content[record.start : record.stop]
+    if record.checksum in {0, checksum := zlib.crc32(value)}:
+        return value, ""
+    return value, f"CRC-32 {checksum:08x}. Must be {record.checksum:08x}, as listed"
+
+
+def _segments(content: _Content, name: str) -> Iterator[tuple[int, int, int]]:
+    """Yield (marker, start, stop) of the segments of a JPEG, up to its compressed data."""
+    at = 2
+    while content[at : at + 2] not in {b"\xff\xda", b"\xff\xd9"}:
+        if content[at : at + 2] == b"\xff\xff":  # a fill byte
+            at += 1
+            continue
+        head = content[at : at + 4]
+        length = int.from_bytes(head[2:])
+        if len(head) < 4 or head[0] != 0xFF or length < 2 or at + 2 + length > len(content):
+            rule = "Must be a marker and the length of a segment"
+            raise ValueError(f"Damaged JPEG '{name}': {head.hex()} at byte {at}. {rule}.")
+        yield head[1], at + 4, at + 2 + length
+        at += 2 + length
+
+
+def _of_jpeg(content: _Content, name: str) -> bytes:
+    """Container that the APP1 segments of a radiometric JPEG hold, joined."""
+    bodies = [content[at:stop] for marker, at, stop in _segments(content, name) if marker == 0xE1]
+    if not (payloads := [body for body in bodies if body.startswith(_SEGMENT)]):
+        label = f"'{name}', an ordinary JPEG or one of another maker"
+        rule = "Must be a radiometric JPEG; else export 16-bit counts as TIFF and use readers.tiff"
+        raise ValueError(f"No thermal data of FLIR in {label}. {rule}.")
+    numbers = [tuple(payload[6:8]) for payload in payloads]
+    if numbers != [(i, numbers[0][-1]) for i in range(numbers[0][-1] + 1)] or len(payloads[-1]) < 8:
+        label = f"FLIR segments {[i for i, *_ in numbers]}"
+        raise ValueError(f"Damaged JPEG '{name}': {label}. Must be whole and in order.")
+    return b"".join(payload[8:] for payload in payloads)
+
+
+def _frame(content: _Content, at: int, place: str) -> tuple[_Frame, int]:
+    """Records of the frame that begins at a byte, and the byte after its last record."""
+    size = len(content)
+    # Header, and the byte order by its version.
+    if (mark := content[at : at + 4]) not in _MARKS or at + _HEADER > size:
+        hint = "" if at else "; is it no recording of FLIR? Then export 16-bit counts as TIFF"
+        rule = f"Must be FLIR's: 'FFF' or 'AFF'{hint}"
+        raise ValueError(f"Invalid header {mark!r} of {place}. {rule}.")
+    orders = [o for o in "><" if 100 <= struct.unpack_from(f"{o}I", content, at + 20)[0] < 200]
+    if not orders:
+        version = content[at + 20 : at + 24].hex()
+        raise ValueError(f"Invalid version {version} of {place}. Must be from 100 to 199.")
+    # Directory of the records.
+    directory, count = struct.unpack_from(f"{orders[0]}II", content, at + 24)
+    listed = directory + _ENTRY * count
+    if directory < _HEADER or count > _MOST_RECORDS or at + listed > size:
+        label = f"directory of {count} records at {directory} of {place}"
+        rule = f"Must be in the file, and of {_MOST_RECORDS} at most"
+        raise ValueError(f"Damaged file: {label}. {rule}.")
+    records, spans = {}, [(directory, listed)]
+    for entry in range(directory, listed, _ENTRY):
+        numbers = struct.unpack_from(f"{orders[0]}HHIIIIIII", content, at + entry)
+        kind, start, length, checksum = numbers[0], *numbers[4:6], numbers[-1]
+        if not kind or not length:
+            continue
+        spans.append((start, start + length))
+        if kind in {_IMAGE, _CAMERA} and kind in records:
+            raise ValueError(f"Repeated record of type {kind} in {place}. Must be listed once.")
+        records[kind] = _Record(at + start, min(at + start + length, size), checksum)
+    # Records must lie one behind another, within the file.
+    spans.sort()
+    stops = [_HEADER, *(stop for _, stop in spans)]
+    for before, (start, stop) in zip(stops, spans, strict=False):
+        if start < before or at + stop > size + _PADDING:
+            label = f"record from {start} to {stop} of {place}"
+            rule = f"Must follow {before}, and end within the {size - at} bytes left"
+            raise ValueError(f"Truncated or damaged file: {label}. {rule}.")
+    if _IMAGE not in records:
+        raise ValueError(f"Missing image in {place}. Has records {sorted(records)}.")
+    return records, min(at + stops[-1], size)

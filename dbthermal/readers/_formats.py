@@ -41,6 +41,7 @@ _FOREIGN: Final = {  # what to do with a format that no reader opens, by suffix 
     **dict.fromkeys(("FITS", "pickle"), "save its array with NumPy and use readers.array"),
     "gzip": "unpack it by gunzip",
     **dict.fromkeys(("PGM", "JPEG 2000"), "save it as PNG of 16 bits and use readers.tiff"),
+    **dict.fromkeys((".xlsx", ".xlsm", ".xls", ".ods"), "a table: export 16-bit counts as TIFF"),
     "text": "a table of temperatures, or a page of a server? Export 16-bit counts as TIFF",
 }
 _LARGEST: Final = 2**46  # of a file that is not read at once [byte]

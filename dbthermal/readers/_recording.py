@@ -44,10 +44,10 @@ _PIECES: Final = 2**14  # of less than 1 kB in a file
 ORDERS: Final = {"<": "little", ">": "big"}  # of bytes, as numpy and people write them
 _JITTER: Final = 0.25  # of the times in names of files [frame]
 _DATE: Final = re.compile(
-    r"(20\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)(?:\D?(\d+))?$|(1\d{9}\.\d+)$"
+    r"(20\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)(?:\D?(\d+))?$|(1\d{9})(\.\d+|\d{3}|\d{6}|\d{9})$"
 )
 _COUNTS: Final = re.compile(  # names of a digital number
-    r"(raw|adc|camera|digital)?[ _]?(counts?|numbers?|levels?|values?)|dn|adu|lsb", re.IGNORECASE
+    r"(raw|adc|camera|digital)?[ _]?(counts?|numbers?|levels?|values?)|dn|dl|adu|lsb", re.IGNORECASE
 )
 _SECONDS: Final = {  # names of units of time, and their seconds
     r"s(ec(ond)?s?)?": 1.0,
@@ -95,11 +95,11 @@ def _moment(stem: str) -> float:
     """Time at which a name ends, of a date or in seconds since 1970 [s]; NaN for other names."""
     if (match := _DATE.search(stem)) is None:
         return np.nan
-    *whole, fraction, unix = match.groups("")
+    *whole, fraction, unix, behind = match.groups("")
     with suppress(ValueError):
         moment = datetime.strptime("".join(whole), "%Y%m%d%H%M%S").replace(tzinfo=UTC)
         return moment.timestamp() + float(f"0.{fraction}")
-    return float(unix or np.nan)
+    return float(f"{unix}.{behind.removeprefix('.')}") if unix else np.nan
 
 
 @contextmanager
@@ -201,7 +201,7 @@ def check_times(values: npt.NDArray[Any], unit: str, clock: Clock | None, name: 
     if values.dtype.kind in "mM":
         values, scales = (values - values[0]) / np.timedelta64(1, "s"), [1.0]
     elif not word:
-        scales = [1.0] if clock is None else [1.0, 1e-3, 1e-6, 1e-9]
+        scales = [1.0] if clock is None else [*_SECONDS.values()]  # in days, of tables
         step = abs(float(values[-1]) - float(values[0])) / max(len(values) - 1, 1)
         if clock is None and not _STEPS[0] < step < _STEPS[1]:  # at 1: numbers of frames?
             label = f"Missing unit of the times of '{name}', which rise by {step:g} a frame"
@@ -280,11 +280,9 @@ def recording(
     late = np.diff(exposed[stamped]) > _GAP * period * np.diff(stamped)
     flags[stamped[1:][late]] |= FileFlag.FRAMES_LOST_BEFORE.value
     # The dataset, with a clock without holes.
-    variables = {
-        "counts": (("time", "y", "x"), counts, schema.STAGES["capture"]["counts"].attrs),
-        "exposure_time": ("time", exposed - exposed[stamped[0]], schema.EXPOSURE_TIME.attrs),
-        "frame_flags": ("time", flags, FileFlag.cf_attrs(schema.FRAME_FLAGS)),
-    }
+    values = {"counts": counts, "exposure_time": exposed - exposed[stamped[0]]}
+    variables = schema.variables("recording", values)
+    variables["frame_flags"] = "time", flags, FileFlag.cf_attrs(schema.FRAME_FLAGS)
     slots = np.arange(exposed.size)  # unknown times on the line between their neighbours
     outside = slots - np.clip(slots, stamped[0], stamped[-1])
     time = np.interp(slots, stamped, exposed[stamped]) + period * outside

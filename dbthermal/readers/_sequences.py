@@ -8,6 +8,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
+from scipy import fft
 
 from dbthermal import _numbers
 from dbthermal._arrays import Array
@@ -93,11 +94,11 @@ def raw(
         rule = "Must be rows, then columns"
         raise ValueError(f"Invalid shape {shape} of '{name}': rougher than {shape[::-1]}. {rule}.")
     decided = {"byte_order": byte_order, "byte_order_by": "caller"}
-    return _recording.clocked(counts, clock, name, *_other_height(counts), format="raw", **decided)
+    return _recording.clocked(counts, clock, name, *_other_size(counts), format="raw", **decided)
 
 
-def _other_height(counts: Counts) -> list[str]:
-    """Sentence on images that are parts of a frame, or several: rows repeat at another distance."""
+def _other_size(counts: Counts) -> list[str]:
+    """Sentence on images that are parts of a frame, or several: they repeat at another distance."""
     height, rows = counts.shape[1], np.concatenate(counts[: 2 * _FIRST]).astype(np.int32)
 
     def change(distance: int) -> float:
@@ -110,7 +111,17 @@ def _other_height(counts: Counts) -> list[str]:
         if change(n) < min(change(n - aside), change(n + aside)) / SMOOTHER:
             said = f"Rows of images repeat after {n}, not {height}. Must be the height of a frame."
             return [said] * (n != height)
-    return []
+    # Any other size, by the autocorrelation of the pixels' pattern: a gradient repeats everywhere.
+    size, signs = counts[0].size, np.sign(np.diff(counts[:_FIRST].ravel().astype(np.int32)))
+    power = np.abs(fft.rfft(signs.astype(np.float32), fft.next_fast_len(2 * signs.size))) ** 2
+    alike = fft.irfft(power)[: signs.size // 2] / np.arange(signs.size, (signs.size + 1) // 2, -1)
+    likely = alike[size // 4 : -1] > 1.0 / SMOOTHER
+    period = size // 4 + int(np.argmax(likely))
+    if len(counts) < _FIRST or not likely.any():
+        return []
+    unlike = np.abs(alike[[period - 1, period + 1, size]]).max()
+    said = f"Numbers repeat after {period}, not {size}. Must be rows times columns of a frame."
+    return [said] * bool(alike[period] > SMOOTHER * unlike)
 
 
 def _are_longer(counts: Counts) -> bool:

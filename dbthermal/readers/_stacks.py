@@ -121,7 +121,7 @@ def tiff(
     groups = groupby(pages, attrgetter("path"))
     size, *lengths = (sum(page.images for page in group) for _, group in groups)
     if step and abs(step / (size * seconds[1]) - 1) > 0.5:  # as of times in a file
-        label = f"The dates of '{name}' are {step:.3g} s apart, {size * seconds[1]:.3g} s by clock="
+        label = f"The dates of '{name}' are {step:.3g} s apart, by clock= {size * seconds[1]:.3g} s"
         sentences.append(f"{label}. Must be the rate of recording.")
     if places is not None and {*lengths[:-1]} <= {size}:  # the last stack may be shorter
         spans = zip(size * places, (size, *lengths), strict=True)

@@ -81,8 +81,7 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
     path : str or Path
         File ``*.html``. Its parents are made.
     capture, response : Dataset, str or Path, optional
-        Corrected capture (band, time, y, x) [count] and the cameras' response: the inputs are shown
-        beside the result, as apparent temperatures if both are given.
+        As for `explorer.explore`.
     regions : mapping of str to explorer.Region, optional
         Name to region, such as ``{"left": explorer.Region("rectangle", ((10, 5), (40, 30)))}`` of
         two corners (row, column), see `explorer.Region`; the whole image if there is none. Of a

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from dbthermal import _numbers, planck, schema
+from dbthermal import _numbers, _text, planck, schema
 from dbthermal._arrays import Array
 from dbthermal.simulation._rig import Rig, blackbody_movies, capture, digitise, observe, pattern
 
@@ -61,8 +61,7 @@ class Background:
     drift: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.kind not in _BACKGROUNDS:
-            raise ValueError(f"Unknown background '{self.kind}'. Must be one of {_BACKGROUNDS}.")
+        _text.check_listed("Unknown background", self.kind, _BACKGROUNDS)
         _numbers.real_number("level [K]", self.level, _numbers.KELVIN)
         for name in ("amplitude", "drift"):
             _numbers.real_number(f"{name} [K]", getattr(self, name), _numbers.FINITE)

@@ -397,7 +397,11 @@ def test_times_beside_frames(tmp_path: Path, name: str) -> None:
     ):
         with pytest.raises(ValueError, match=r"Invalid times of .* Must agree to half a frame"):
             read(hdf5(path, **{name: times}))
+    days = {name.removesuffix("_s"): 45000 + np.arange(3) / 864e3}  # as in tables
+    assert_array_equal(read(hdf5(path, **days)).counts, scene())
     assert_array_equal(read(hdf5(path, **{name: np.arange(9.0)})).counts, scene())
+    with pytest.raises(ValueError, match=rf"Invalid axes of 'frames' .* '{name}' has 32\. Must be"):
+        read(hdf5(path, **{name: np.arange(32.0)}))
     with pytest.raises(ValueError, match="Invalid times"):
         read(hdf5(path, **{f"other/{name}": np.arange(3.0)}))
     two = {f"other/{name}": np.arange(3.0), "other/frames": scene()}
@@ -604,3 +608,57 @@ def test_a_chunk_in_a_shard_unpacks_to_its_size(tmp_path: Path) -> None:
     shard.write_bytes(packed + index + struct.pack("<I", google_crc32c.value(index)))
     with pytest.raises(ValueError, match=r"Damaged chunk '0' of 'a\.zarr'"):
         read(path)
+
+
+@pytest.mark.parametrize("change", [{"shape": [1, 24, 32]}, {"data_type": "int16"}])
+def test_consolidated_metadata_are_a_copy(tmp_path: Path, change: dict[str, Any]) -> None:
+    """Those that say something else than the array's are not used."""
+    zarr.open_group(tmp_path / "a.zarr", mode="w").create_array("frames", data=scene())
+    with pytest.warns(UserWarning, match="Consolidated metadata"):
+        zarr.consolidate_metadata(tmp_path / "a.zarr")
+    file = tmp_path / "a.zarr" / "zarr.json"
+    about = json.loads(file.read_text())
+    about["consolidated_metadata"]["metadata"]["frames"] |= change
+    file.write_text(json.dumps(about))
+    assert_array_equal(read(tmp_path / "a.zarr").counts, scene())
+
+
+@pytest.mark.parametrize(
+    ("code", "lossless"),
+    [
+        (numcodecs.Delta("u2"), True),
+        (numcodecs.Shuffle(2), True),
+        (numcodecs.Fletcher32(), True),
+        (numcodecs.FixedScaleOffset(offset=0, scale=0.1, dtype="u2"), False),
+        (numcodecs.Quantize(digits=1, dtype="f4"), False),
+    ],
+)
+def test_filters_that_change_counts_are_refused(tmp_path: Path, code: Any, lossless: bool) -> None:
+    """By their names; those that change nothing are read."""
+    zarr.create_array(tmp_path / "a.zarr", data=scene(), filters=[code], zarr_format=2)
+    if lossless:
+        assert_array_equal(read(tmp_path / "a.zarr").counts, scene())
+    else:
+        with pytest.raises(ValueError, match=rf"Invalid filter '{code.codec_id}' of 'a'"):
+            read(tmp_path / "a.zarr")
+
+
+@pytest.mark.parametrize("frames", [1, 2])
+def test_shards_that_end_beyond_the_frames(tmp_path: Path, frames: int) -> None:
+    """A last shard that is not full lacks nothing."""
+    counts = scene()[:frames]
+    options: dict[str, Any] = {"chunks": (1, 12, 16), "shards": (2, 36, 32)}
+    zarr.create_array(tmp_path / "a.zarr", data=counts, **options)
+    assert_array_equal(read(tmp_path / "a.zarr").counts, counts)
+
+
+def test_arrays_of_unknown_size() -> None:
+    """Of dask, after a selection by values: the shape is named."""
+
+    class Unknown:
+        """Array of which the number of frames is not known."""
+
+        shape, dtype, ndim = (float("nan"), 8, 8), np.dtype("u2"), 3
+
+    with pytest.raises(ValueError, match=r"Invalid shape \(nan, 8, 8\) of 'array'"):
+        read(Unknown())

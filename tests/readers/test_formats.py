@@ -33,7 +33,7 @@ def test_commands_read_by_first_bytes(tmp_path: Path, capsys: pytest.CaptureFixt
     for name in ("a.hdf", "a.dat", "a1.bin"):
         status, text = info(capsys, tmp_path / name, *STATED)
         assert status == 0, text
-        assert "recording of one band" in text
+        assert "stage: recording" in text
     (tmp_path / "b.bin").write_bytes(sequence(scene()))
     assert info(capsys, tmp_path / "b.bin")[0] == 0
 
@@ -72,9 +72,10 @@ def test_foreign_formats_are_named(tmp_path: Path) -> None:
             stated: Any = {} if read is readers.flir else options
             with pytest.raises(ValueError, match=rf"Refused 'a\.dat', a {expected}"):
                 read(path, **stated)
-    for suffix in ("ravi", "irb", "ats"):
+    ways = {"ravi": "export its counts", "irb": "export its counts", "xlsx": "a table: export 16"}
+    for suffix, way in ways.items():
         (tmp_path / f"a.{suffix}").write_bytes(b"something else")
-        with pytest.raises(ValueError, match=rf"Refused 'a\.{suffix}': export its counts"):
+        with pytest.raises(ValueError, match=rf"Refused 'a\.{suffix}': {way}"):
             readers.flir(tmp_path / f"a.{suffix}")
 
 

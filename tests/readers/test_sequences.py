@@ -135,6 +135,8 @@ def test_raw(tmp_path: Path) -> None:
     for rise, is_told in ((warming, True), (np.zeros(1), False)):
         path.write_bytes((20000 + pattern + rise + noise).astype("<u2").tobytes())
         assert not bare(path).attrs.get("warnings")
+        with pytest.warns(UserWarning, match="Numbers repeat after 768, not 640"):
+            bare(path, shape=(20, 32))
         for height in (8, 12, 48, 96):  # parts of a frame, and several
             with pytest.warns(UserWarning, match=f"repeat after 24, not {height}"):
                 bare(path, shape=(height, 32))

@@ -98,18 +98,18 @@ def test_a_capture_goes_through_corrections(pair: tuple[xr.Dataset, xr.Dataset])
     assert aligned.counts.sel(band="9.5")[~late.values].notnull().all()
 
 
-UNKNOWN = r"Invalid 'exposure_time' of band '9.5' .* Must be known, finite"
+UNKNOWN = r"Invalid 'exposure_time' of the recording of band '9.5' .* Must be known, finite"
 OTHERS: dict[str, tuple[Callable[[xr.Dataset], xr.Dataset], str]] = {
     "unknown": (lambda one: one.assign(exposure_time=one.exposure_time * np.nan), UNKNOWN),
     "infinite": (lambda one: one.assign(exposure_time=1 / one.exposure_time), UNKNOWN),
     "resting": (lambda one: one.assign(exposure_time=one.exposure_time * 0 - 1), UNKNOWN),
-    "falling": (lambda one: one.assign_coords(time=-one.time), "Must be known, finite and rise"),
+    "falling": (lambda one: one.assign_coords(time=-one.time), "Unordered 'time' of .* band '9.5'"),
     "truth": (lambda one: one.astype(bool), "Invalid dtype bool of .* of band '9.5'"),
     "crop": (lambda one: one.isel(x=slice(1, None)), r"Different sizes \(24, 32\) and \(24, 31\)"),
     "undated": (lambda one: one.drop_attrs(deep=False), r"Unknown dates .* offset="),
     "temperatures": (lambda one: one.astype("f4"), "Invalid dtype float32 of .* of band '9.5'"),
-    "picture": (lambda one: one.drop_vars("exposure_time"), "'exposure_time' is missing"),
-    "timeless": (lambda one: one.drop_vars("time"), "'time' is missing"),
+    "picture": (lambda one: one.drop_vars("exposure_time"), "Missing variable 'exposure_time'"),
+    "timeless": (lambda one: one.drop_vars("time"), "Missing coordinate 'time'"),
 }
 
 

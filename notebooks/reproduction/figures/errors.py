@@ -8,8 +8,7 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from dbthermal.figures import REASONS
-from dbthermal.figures._maps import first_reason
+from dbthermal.figures import REASONS, first_reason
 from dbthermal.figures.drawing import (
     COLORS,
     band_label,
