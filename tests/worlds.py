@@ -43,6 +43,8 @@ class World:
     detail: float = 0.0  # of the emissivity [1]
     fabric: Pair | None = None  # emissivities of every second person [1]
     flicker: float = 0.0  # corner frequency of 1/f noise of each pixel [Hz]
+    level: Pair = (0.0, 0.0)  # white noise that each frame of a band has in common [K]
+    wander: Pair = (0.0, 0.0)  # of each band's level, correlated over 10 s [K]
     lamp: float = 0.0  # amplitude of a spot that is heated at 0.4 Hz [K]
     behind: Pair | None = None  # transmittances, with other people behind [1]
     breath: float = 0.0  # motion of the object at 0.25 Hz [pixel]
@@ -137,6 +139,7 @@ def seen(world: World, seed: int) -> tuple[xr.Dataset, Array]:
     times = np.stack([time, (time + world.lag) * (1.0 + world.fast)])
     if world.jitter:
         times = times + world.jitter * np.random.default_rng([seed, 1]).standard_normal(times.shape)
+    common = levels(np.random.default_rng([seed, 3]), world)
     breath = world.breath * np.outer(np.sin(0.5 * np.pi * time), [1.0, 0.3])
     film = np.empty((2, FRAMES, *SHAPE), dtype=np.float32)
     inside = slice(MARGIN, -MARGIN)
@@ -154,7 +157,8 @@ def seen(world: World, seed: int) -> tuple[xr.Dataset, Array]:
         film_of_object = truth
         if np.any(times[band] != time):
             film_of_object = interp1d(time, truth, axis=0, fill_value="extrapolate")(times[band])
-        noise = noise_of(rng, world.flicker) * world.noise[band] * curve.reference_slope
+        noise = noise_of(rng, world.flicker) * world.noise[band] + common[band]
+        noise *= curve.reference_slope
         for frame in range(FRAMES):
             share, warm = (
                 moved(image, breath[frame]) for image in (emissivity[band], film_of_object[frame])
@@ -174,6 +178,20 @@ def seen(world: World, seed: int) -> tuple[xr.Dataset, Array]:
     if world.stamped:
         capture["exposure_time"] = ("band", "time"), times, {"units": "s"}
     return capture.assign_attrs(origin="simulated"), truth[:, inside, inside]
+
+
+def levels(rng: np.random.Generator, world: World) -> Array:
+    """Noise (band, time, 1, 1) [K] that whole frames have in common, of mean zero."""
+    memory = np.exp(-1.0 / RATE / 10.0)
+    steps = rng.standard_normal((2, FRAMES))
+    for frame in range(1, FRAMES):
+        steps[:, frame] *= np.sqrt(1.0 - memory**2)
+        steps[:, frame] += memory * steps[:, frame - 1]
+    steps -= steps.mean(axis=1, keepdims=True)
+    white = rng.standard_normal(steps.shape) * np.reshape(world.level, (2, 1))
+    return np.asarray(
+        (white + steps * np.reshape(world.wander, (2, 1)))[..., np.newaxis, np.newaxis]
+    )
 
 
 def noise_of(rng: np.random.Generator, corner: float) -> Array:

@@ -81,7 +81,8 @@ def align(
         exposure times of the band `clock` on the first band's clock. After a warp, a pixel's
         `status` is that of all the pixels that it may be made of; `noise_factor` (band) [1], by how
         much interpolation in time and over pixels lessens the noise, root mean square;
-        `pattern_std`, lessened over pixels. Attributes: `clock`, `time_offset` (of each band) [s],
+        `pattern_std`, lessened over pixels. Attributes: `clock`, `rapid_noise_factor` (as
+        `noise_factor`, of differences of frames), `time_offset` (of each band) [s],
         `time_offset_std` [s] where the images tell it, `frames_lost` (of each band), `pauses`
         (times of the frames before and after each gap of more than 20 frame periods, in turn) [s],
         `transform` (the matrices, row by row). Other variables over `time`, as `exposure_time` and

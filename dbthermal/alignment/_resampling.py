@@ -212,7 +212,8 @@ def on_one_clock(
     reference = int(np.argmax(relative)) if clock is None else names.index(clock)
     times, segment = clocks.fill_times(stamps[reference]), schema.segments(corrected)
     # Plan the interpolation of each band, and how it reduces noise.
-    plans, factors, thin = [], np.ones(len(names)), -(-signals[0].size // lags.TELLING)
+    plans, thin = [], -(-signals[0].size // lags.TELLING)
+    factors, rapid = np.ones((2, len(names)))
     # Frames that are NaN, or a copy of the frame before, in every block of rows.
     blocks = (counts.isel(y=rows).values for rows in _rows.blocks(counts.shape))
     copies = [[clocks.missing(single(film)) for film in block] for block in blocks]
@@ -222,8 +223,10 @@ def on_one_clock(
         plan.valid[plan.labels(segment) != segment] = False
         shown = np.stack([signals[it, :, ::thin] for it in (reference, band)])
         plans.append(lags.bent(plan, shown, times, segment, np.sqrt(3.0) * steps * noise[band]))
-        square = (plans[band].matrix() ** 2).sum()  # of independent noises
-        factors[band] = np.sqrt(square / max(plan.valid.sum(), 1))
+        matrix = plans[band].matrix()[plan.valid]  # of independent noises
+        factors[band] = np.sqrt((matrix**2).sum() / max(plan.valid.sum(), 1))
+        twice = matrix[2:] - 2.0 * matrix[1:-1] + matrix[:-2]
+        rapid[band] = np.sqrt((twice**2).sum() / max(6 * twice.shape[0], 1))
 
     def aligned(rows: slice) -> Movie:
         """Counts of some rows at the times of the reference."""
@@ -246,9 +249,11 @@ def on_one_clock(
     movie = _rows.lazy(aligned, counts) if lazy else counts.copy(data=aligned(slice(None)))
     result = _assembled(corrected, movie, times)
     factors = factors * schema.noise_factor(corrected)
+    rapid *= corrected.attrs.get("rapid_noise_factor", 1.0)
     result = result.assign(noise_factor=("band", factors, schema.NOISE_FACTOR.attrs))
     return result.assign_attrs(
         clock=names[reference],
+        rapid_noise_factor=rapid.tolist(),
         time_offset=offsets.tolist(),
         frames_lost=lost,
         pauses=clocks.pauses(times).ravel().tolist(),

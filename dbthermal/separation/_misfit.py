@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 from scipy.ndimage import uniform_filter
+from scipy.sparse import csr_array
 
 from dbthermal import _smooth as smooth
 from dbthermal import schema
@@ -32,6 +33,7 @@ from dbthermal.separation._subspace.fused import FILMS
 Whole = npt.NDArray[np.intp]
 
 _BLOCK: Final = 4  # pixels along a side of what is averaged
+_WINDOWS: Final = 4  # of some rows, that tell what a frame has in common
 _AROUND: Final = 5  # blocks along a side of a neighbourhood
 # Samples of a row of a band, beyond which rows are not read two at a time: an hour of 640 columns
 # at 30 Hz takes 4.7 GB, not 5.7.
@@ -69,6 +71,7 @@ class Misfit:
     change: Array  # deviation of the object's signal, at any time (y, x) [K]
     single: Array  # deviation of that signal by noise of single pixels that is not white (y, x) [K]
     answers: dict[Probe, list[Any]]  # to each probe, of the rows that it asks
+    levels: tuple[Array, Array]  # normal equations (window, ...) of what a frame has in common
 
     @property
     def size(self) -> float:
@@ -95,14 +98,14 @@ class _Blocks(NamedTuple):
 def measure(inputs: Inputs, result: xr.Dataset, workers: int, *probes: Probe) -> Misfit:
     """Measure how far unflagged pixels deviate from a model; the probes are asked in passing."""
 
-    def examine(rows: slice) -> tuple[_Blocks, list[Any]]:
+    def examine(rows: slice) -> tuple[_Blocks, tuple[Array, Array], list[Any]]:
         reading = reflected(inputs, result, rows)
         sums = [probe(inputs, result, reading) for probe in probes]
-        return _of_rows(inputs, result, reading), sums
+        return *_of_rows(inputs, result, reading), sums
 
     is_long = inputs.capture["counts"][0, :, 0].size > _LONG
     with ThreadPoolExecutor(1 if is_long else workers) as threads:
-        sections, sums = zip(*threads.map(examine, inputs.blocks), strict=True)
+        sections, common, sums = zip(*threads.map(examine, inputs.blocks), strict=True)
     blocks = _Blocks(*(np.concatenate(maps, axis=-2) for maps in zip(*sections, strict=True)))
     answers = {
         probe: [value for value in values if value is not None]
@@ -117,7 +120,8 @@ def measure(inputs: Inputs, result: xr.Dataset, workers: int, *probes: Probe) ->
     row = np.repeat(np.arange(len(heights)), heights)
     place = np.ix_(row, np.arange(result.sizes["x"]) // _BLOCK)
     leak, change, single = (values(blocks)[place] for values in (_leak, _change, _single))
-    return Misfit(leak, change, single, answers)
+    forms, forces = (np.concatenate(parts) for parts in zip(*common, strict=True))
+    return Misfit(leak, change, single, answers, (forms, forces))
 
 
 def _local_mean(blocks: _Blocks, values: Array) -> Array:
@@ -170,8 +174,10 @@ def _leak(blocks: _Blocks) -> Array:
     return np.asarray(np.sqrt(np.where(scatter > _SURE * doubt, scatter, 0.0)))
 
 
-def _of_rows(inputs: Inputs, result: xr.Dataset, reading: Reading) -> _Blocks:
-    """Averages over the blocks of some rows."""
+def _of_rows(
+    inputs: Inputs, result: xr.Dataset, reading: Reading
+) -> tuple[_Blocks, tuple[Array, Array]]:
+    """Averages over the blocks of some rows, and what they tell of the frames' levels."""
     rows, signals, reflections, frames, pixels, gain = reading
     ratio = result["reflection_ratio"].values[inputs.bands, rows].reshape(len(signals), -1)
     pixels = pixels & np.isfinite(ratio).all(axis=0)
@@ -188,8 +194,13 @@ def _of_rows(inputs: Inputs, result: xr.Dataset, reading: Reading) -> _Blocks:
     length = _length(frames.size)
     event, half = np.divmod(np.flatnonzero(frames), length)
     span = np.unique(2 * event + (2 * half >= length), return_inverse=True)[1]
-    remainder, reflection = np.zeros((2, signals.shape[1], number.size))
-    _average(signals[0], reflections, weights, place, remainder, reflection)
+    every, size = np.flatnonzero(pixels), (pixels.size, number.size)
+
+    def total(film: Array, weight: Array) -> Array:
+        return np.asarray(film @ csr_array((weight[pixels], (every, place[pixels])), shape=size))
+
+    remainder = sum(map(total, reflections, weights), np.zeros((signals.shape[1], number.size)))
+    reflection = total(signals[0], np.ones(pixels.size))
     single = _single_pixels(inputs, signals, weights, frames, place, column, number.size)
     release()
     filled = np.maximum(number, 1.0)
@@ -200,6 +211,13 @@ def _of_rows(inputs: Inputs, result: xr.Dataset, reading: Reading) -> _Blocks:
     remainder, reflection = remainder / filled, reflection / filled
     remainder -= basis @ (basis.T @ remainder)
     reflection -= basis @ (basis.T @ reflection)
+    # What a frame has in common, see `Misfit.levels`.
+    weights = np.stack([np.bincount(place[pixels], it[pixels], number.size) for it in weights])
+    weights, precise = weights / filled, quotient(weights, noise[0] * filled, 0.0)
+    windows = np.array_split(np.arange(number.size).reshape(shape), _WINDOWS, axis=1)
+    force = np.zeros((_WINDOWS, len(weights), frames.size))
+    force[..., frames] = [precise[:, it.ravel()] @ remainder[:, it.ravel()].T for it in windows]
+    form = np.array([precise[:, it.ravel()] @ weights[:, it.ravel()].T for it in windows])
     stated = _stated(inputs, result, rows, pixels)
     stated = np.bincount(place[pixels], stated[pixels], number.size) / filled
     resampled = np.any(schema.noise_factor(inputs.capture) < 1.0)
@@ -219,7 +237,8 @@ def _of_rows(inputs: Inputs, result: xr.Dataset, reading: Reading) -> _Blocks:
         - freedom * noise[2:0:-1, np.newaxis],
         freedom,
     )
-    return _Blocks(*(values.reshape(*values.shape[:-1], *shape) for values in averages))
+    blocks = _Blocks(*(values.reshape(*values.shape[:-1], *shape) for values in averages))
+    return blocks, (form, force)
 
 
 def _single_pixels(
@@ -236,8 +255,32 @@ def _single_pixels(
     middle = np.flatnonzero(column[:-1] % _BLOCK == 1)
     alike = (place[middle - 1] == place[middle]) & (place[middle] == place[middle + 1])
     middle = middle[alike & (place[middle] >= 0)]
-    segment = schema.segments(inputs.capture)[frames]
-    squares = _compare(signals, weights, middle, segment, _length(len(frames)) // 2)
+    values = np.zeros((signals.shape[1], middle.size))
+    for step, part in ((-1, -1.0), (0, 2.0), (1, -1.0)):
+        pixels = middle + step
+        for film, weight in zip(signals, weights, strict=True):
+            values += part * weight[pixels] * film[:, pixels]
+    # Second differences in time, too, of means over some frames and of frames; none across a
+    # shutter event. Of independent noise both have 36 times its variance.
+    segment, length = schema.segments(inputs.capture)[frames], _length(len(frames)) // 2
+    number = len(values) // length
+
+    def variance(films: Array, segments: Whole) -> Array:
+        jumps = np.diff(films, 2, axis=0)[segments[:-2, 0] == segments[2:, -1]]
+        return np.asarray(np.sum(jumps**2, axis=0) / (36.0 * max(len(jumps), 1)))
+
+    groups = (array[: number * length].reshape(number, length, -1) for array in (values, segment))
+    means, segments = next(groups).mean(axis=1), next(groups)[..., 0]
+    squares = np.stack(
+        [variance(means, segments), variance(values, segment[:, np.newaxis]) / length]
+    )
+    # Between frames that were interpolated in time, noise differs less than means of them tell.
+    before = inputs.noise / schema.noise_factor(inputs.capture)
+    after = before * inputs.capture.attrs.get("rapid_noise_factor", 1.0)
+    white, rapid = (
+        np.square(it[inputs.bands]) @ np.square(weights[:, middle]) for it in (before, after)
+    )
+    squares[1] *= quotient(white, rapid, 1.0)
     sums = np.stack([np.bincount(place[middle], values, blocks) for values in squares])
     return np.asarray(sums / np.maximum(np.bincount(place[middle], minlength=blocks), 1.0))
 
@@ -345,61 +388,6 @@ def _weights(ratio: Array, deviation: Array) -> tuple[Array, Array]:
     total, first = np.sum((every * deviation) ** 2, axis=0), deviation[0] ** 2
     # Variances of the weighted sum and of the reflection, and their covariance [K^2].
     return every, np.stack([total, first, every[0] * first])
-
-
-@compiled
-def _average(
-    signal: Array,
-    reflections: Array,
-    weights: Array,
-    place: Whole,
-    remainder: Array,
-    reflection: Array,
-) -> None:
-    """Add up what is left beside the object, and the reflection, by block, in place."""
-    for t in range(len(signal)):
-        for p in range(place.size):
-            b = place[p]
-            if b >= 0:
-                for m in range(len(reflections)):
-                    remainder[t, b] += weights[m, p] * reflections[m, t, p]
-                reflection[t, b] += signal[t, p]
-
-
-@compiled
-def _compare(signals: Array, weights: Array, middle: Whole, segment: Whole, length: int) -> Array:
-    """Variances (2, middle) [K^2] of means over `length` frames, and of frames over `length`."""
-    # Of second differences over three pixels in a row and in time, none across a shutter event;
-    # both variances are the same for noise that is independent in time.
-    result = np.zeros((2, middle.size))
-    for i in range(middle.size):
-        p = middle[i]
-        number = np.zeros(2)
-        before = last = mean_before = mean_last = total = 0.0
-        since = 0
-        for t in range(segment.size):
-            if t > 0 and segment[t] != segment[t - 1]:
-                since, total = 0, 0.0
-            value = 0.0
-            for m in range(len(signals)):
-                value += 2.0 * weights[m, p] * signals[m, t, p]
-                value -= weights[m, p - 1] * signals[m, t, p - 1]
-                value -= weights[m, p + 1] * signals[m, t, p + 1]
-            if since > 1:
-                result[1, i] += (value - 2.0 * last + before) ** 2 / length
-                number[1] += 1.0
-            before, last = last, value
-            total += value / length
-            since += 1
-            if since % length == 0:
-                if since > 2 * length:
-                    result[0, i] += (total - 2.0 * mean_last + mean_before) ** 2
-                    number[0] += 1.0
-                mean_before, mean_last, total = mean_last, total, 0.0
-        # A second difference of independent noise has six times its variance, two in turn 36 times.
-        for kind in range(2):
-            result[kind, i] /= 36.0 * max(number[kind], 1.0)
-    return result
 
 
 def widen(inputs: Inputs, result: xr.Dataset, misfit: Misfit) -> None:

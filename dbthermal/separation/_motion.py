@@ -29,7 +29,7 @@ from dbthermal._arrays import Array, Mask, quotient
 from dbthermal._samples import without_gaps
 from dbthermal.schema import Status
 from dbthermal.separation._inputs import Inputs
-from dbthermal.separation._misfit import Misfit, Reading, Whole, smooth_functions
+from dbthermal.separation._misfit import Misfit, Reading, Whole, object_weights, smooth_functions
 from dbthermal.separation._overlay import (
     PARAMETERS,
     SURE,
@@ -58,6 +58,8 @@ _LEAST: Final = 0.1  # motion of a band that matters, rms [pixel]: two depths fe
 _SIDES, _AROUND, _SAMPLES = (8, 32), 6, 2**24
 _TURNS, _STEP, _SETTLED = 6, 2.0, 0.02
 _SEARCHED, _REPEATS = 2, 2  # turns in which ratios are sought, and rounds of the weights
+# Of noise that whole frames have in common: powers of time's functions, and white noise over it.
+_POWERS, _WHITES = np.linspace(0.0, 2.0, 9), (0.0, 0.1, 1.0, 10.0)
 # Ratios that are tried, of reflectivities; and the variance over that of noise of a pixel that
 # counts half.
 _RATIOS: Final = np.exp(np.append(np.linspace(-1.2, -0.15, 4), np.linspace(0.15, 1.5, 9)))
@@ -73,16 +75,29 @@ _DEGREES, _WINDOWS, _FRAMES = 6, 4, 128
 
 @dataclass(frozen=True)
 class Stabilised(Moved):
-    """A capture whose frames lie on one another."""
+    """A capture whose frames lie on one another, and have no noise in common."""
+
+    levels: Array  # of whole frames (band, time) [K]
+    wander: Array  # covariance of what is expected of them in smooth functions (band, band) [K^2]
+
+    def detail(self, inputs: Inputs, result: xr.Dataset) -> Array:
+        """Deviation (y, x) [K] of the object's signal by the motion and the levels left."""
+        weights = object_weights(inputs, result)
+        square = np.einsum("ayx,byx,ab->yx", weights, weights, self.wander)
+        return np.asarray(np.hypot(super().detail(inputs, result), np.sqrt(square)))
 
     def sentence(self, *, undone: bool) -> str:
-        """Sentence on how far the image of each band moved."""
-        sizes = ", ".join(
-            f"'{band}' {size_of(path):.2f}"
-            for band, path in zip(self.capture["band"].values, self.motion, strict=True)
-        )
+        """Sentence on how far the image of each band moved, and on the frames' levels."""
+        texts = list[str]()
+        for text, unit, sizes in (
+            ("The image moved", "pixel", [size_of(path) for path in self.motion]),
+            ("The level of whole frames varied", "K", np.std(self.levels, axis=1)),
+        ):
+            pairs = zip(self.capture["band"].values, sizes, strict=True)
+            every = ", ".join(f"'{band}' {size:.2g}" for band, size in pairs)
+            texts += [f"{text}, by {every} {unit} (rms)"] if np.any(sizes) else []
         outcome = "was undone" if undone else "could not be undone: intervals may be too small"
-        return f"The image moved, by {sizes} pixel (rms), which {outcome}."
+        return f"{'; '.join(texts)}, which {outcome}."
 
 
 def stabilise(
@@ -90,9 +105,9 @@ def stabilise(
     inputs: Inputs,
     result: xr.Dataset,
     misfit: Misfit,
-    before: Array | None = None,
+    before: Stabilised | None = None,
 ) -> Stabilised | None:
-    """Move each frame back by the cameras' motion, beside one found before; None without motion."""
+    """Move each frame back by the cameras' motion, less its level; None if there is neither."""
     shape, status = corrected["counts"].shape, result["status"].values
     steps, slow = np.zeros((*shape[:2], PARAMETERS)), np.zeros(PARAMETERS)
     disturbed = np.mean((status & np.uint32(_DISTURBED)) != 0) > _MANY
@@ -100,10 +115,59 @@ def stabilise(
         steps = _rapid(corrected, inputs)
         slow = _expected(inputs, steps.mean(axis=0))
     steps[..., :2] += _slow(inputs, misfit)
-    motion = steps if before is None else steps + before
+    levels, wander = _levels(inputs, misfit)
+    motion = steps if before is None else steps + before.motion
     if not np.any(steps) or max(map(size_of, motion)) < _LEAST:
-        return None
-    return Stabilised(moved(corrected, inputs, motion), motion, slow)
+        motion, slow = motion - steps, 0.0 * slow
+        if not levels.any():
+            return None
+    levels += 0.0 if before is None else before.levels
+    capture = moved(corrected, inputs, motion) if motion.any() else corrected
+    slopes = np.array([curve.reference_slope for curve in inputs.curves])
+    offsets = (levels * slopes[:, np.newaxis])[..., np.newaxis, np.newaxis].astype(np.float32)
+    counts = np.subtract(capture["counts"].values, offsets, dtype=np.float32)
+    capture = capture.assign(counts=capture["counts"].copy(data=counts))
+    return Stabilised(capture, motion, slow, levels, wander)
+
+
+def _levels(inputs: Inputs, misfit: Misfit) -> tuple[Array, Array]:
+    """Levels (band, time) [K] of whole frames, and expected covariance (band, band) of slow ones.
+
+    Zero along directions, of the bands over their noise, in which frames have nothing in common.
+    """
+    time, bands = inputs.capture["time"].values.astype(np.float64), inputs.bands
+    form, force = misfit.levels
+    shape, prior = np.diag(inputs.noise[bands]), np.eye(len(bands))
+    shape = shape @ np.linalg.eigh(shape @ form.sum(axis=0) @ shape)[1]
+    form, force = (shape.T @ form @ shape)[:, np.newaxis], np.swapaxes(force, 1, 2) @ shape
+    # Functions of time above the smooth ones tell whether there are levels, and of what spectrum.
+    first = min(smooth.HIGHEST_ORDER, time.size // 4)
+    functions = smooth.polynomial_basis(time, min(8 * first, 3 * time.size // 4))[:, first:]
+    none = np.zeros((functions.shape[1], len(bands)))
+    steps, variance = jackknife(form, functions.T @ force, prior, none)
+    score = np.median(quotient(steps**2, variance, 0.0)[:first], axis=0)
+    shape = shape * (score > SURE)
+    levels, wander = (
+        np.zeros((len(inputs.noise), size)) for size in (time.size, len(inputs.noise))
+    )
+    levels[bands] = shape @ solved(form.sum(axis=0) + prior, force.sum(axis=0)).T
+    wander[np.ix_(bands, bands)] = shape * _below(steps**2, first) / time.size @ shape.T
+    return levels, wander
+
+
+def _below(squares: Array, first: int) -> Array:
+    """Expected sum of squares below the `first` function, of those above (function, direction).
+
+    Variances are taken as A (j^-b + r) in function j: white noise, and noise that grows to slow
+    changes by up to that of a random walk, b = 2. Mean over b and r, by their likelihood.
+    """
+    order = np.arange(1.0, first + len(squares))
+    shapes = np.array([order**-b + r * first**-b for b in _POWERS for r in _WHITES])
+    below, above = np.split(shapes, [first - 1], axis=1)
+    size = np.mean(squares / above[..., np.newaxis], axis=1) + np.finfo(float).tiny
+    likely = -0.5 * (np.log(above).sum(axis=1)[:, np.newaxis] + len(squares) * np.log(size))
+    weights = np.exp(likely - likely.max(axis=0))
+    return np.asarray(np.average(size * below.sum(axis=1, keepdims=True), 0, weights))
 
 
 def _expected(inputs: Inputs, path: Array) -> Array:

@@ -274,7 +274,8 @@ def _displacement(first: Array, second: Array, drift: Array, noise: Array) -> tu
     # From coarse detail to fine, as far as both bands show it.
     for blur in _BLURS:
         views = _Views(first, second, drift, pixels[:, most], blur)
-        start = path if path.any() else views.nearest()
+        # Few coarse windows may lead astray: begin where most show the same.
+        start = max((path, views.nearest()), key=lambda it: np.count_nonzero(views.compared(it)[2]))
         level = _refined(views, start, noise**2 / (4.0 * np.pi * blur**2))
         if level is None:
             break
@@ -289,7 +290,8 @@ def _displacement(first: Array, second: Array, drift: Array, noise: Array) -> tu
     # Compare what the bands do not have in common with the motion and without it.
     after, before = (np.sum(views.compared(it)[1] ** 2, axis=(0, 2)) for it in (path, none))
     explained = np.median(quotient(after[alike], before[alike], 1.0)) < _LEFT
-    sure = np.any(quotient(path**2, spread, 0.0) > SURE)
+    # A growth is no evidence: heat that spreads feigns it.
+    sure = np.any(quotient(path**2, spread, 0.0)[:-1] > SURE)
     # No motion that is unsure, too small to matter, or does not explain the difference.
     return (path, spread) if sure and explained and size_of(path) > _LEAST else (none, none)
 

@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 
 from dbthermal import _numbers, _samples, alignment, schema
-from dbthermal._arrays import Array, without_blas_threads
+from dbthermal._arrays import without_blas_threads
 from dbthermal._warnings import warned
 from dbthermal.alignment._planes import Scale, share_displaced
 from dbthermal.alignment._reflections import seen_apart
@@ -190,11 +190,10 @@ def separate(  # noqa: PLR0913 - all but the first two by name
 
 def _on_one_clock(
     capture: xr.Dataset, once: Callable[..., tuple["Measured", Misfit]]
-) -> tuple[xr.Dataset, tuple["Measured", Misfit], list[str], Array | float]:
+) -> tuple[xr.Dataset, tuple["Measured", Misfit], list[str]]:
     """Separate, and again on one clock if the bands show the same at different times."""
     outcome = once(capture)
-    # Capture, outcome, sentences, and deviation (y, x) [K] of the object by the choice of clock.
-    unchanged = capture, outcome, list[str](), 0.0
+    unchanged = capture, outcome, list[str]()
     names, share = capture["band"].values.tolist(), outcome[0].asynchronous
     if share <= _SOME:
         return unchanged
@@ -203,53 +202,38 @@ def _on_one_clock(
             aligned = alignment.align(capture, clock=names[0])
     except ValueError:  # nothing tells the clocks: the pixels keep the flag
         return unchanged
-    times, aligned = aligned["time"], aligned.assign_coords(time=capture["time"])
-    retry = unchanged[1] if _lacking(aligned) else once(aligned)
+    aligned = aligned.assign_coords(time=capture["time"])
+    # Not if a band lacks more samples than can be bridged: at steps none is interpolated.
+    lost = ~schema.measured(_samples.some_pixels(aligned["counts"]))
+    retry = outcome if lost.mean(axis=(1, 2)).max() > MOST_BRIDGED else once(aligned)
     if not retry[0].asynchronous < _LESS * share:
         return unchanged
     offsets, std = np.array(aligned.attrs["time_offset"]), aligned.attrs.get("time_offset_std")
     place = int(np.abs(offsets).argmax())
-    detail: Array | float = 0.0
-    if np.any(aligned["noise_factor"] < schema.noise_factor(capture)):
-        # Between frames the rapid changes of the band that is interpolated are too small.
-        offset = xr.DataArray(offsets, {"band": names}, "band")
-        exchanged = alignment.align(capture, offset=offset, clock=names[place])
-        if _lacking(exchanged):
-            return unchanged
-        second = once(exchanged)[0].result
-        films = [result["object_temperature"] for result in (retry[0].result, second)]
-        change = films[1].interp(time=times) - films[0].values
-        detail = np.nan_to_num(0.5 * np.sqrt((change**2).mean("time").values))
     known = "" if std is None else f", known to {std:.4f} s"
     sentence = f"The clocks differ: band '{names[place]}' was taken {offsets[place]:+.4f} s after "
     sentence += f"'{names[0]}'{known}, and was interpolated."
-    return aligned, retry, [*(str(note.message) for note in notes), sentence], detail
-
-
-def _lacking(aligned: xr.Dataset) -> bool:
-    """Say that a band lacks more samples than can be bridged: at steps none is interpolated."""
-    lost = ~schema.measured(_samples.some_pixels(aligned["counts"]))
-    return bool(lost.mean(axis=(1, 2)).max() > MOST_BRIDGED)
+    return aligned, retry, [*(str(note.message) for note in notes), sentence]
 
 
 def _mended(
     original: xr.Dataset, once: Callable[..., tuple["Measured", Misfit]]
 ) -> tuple[xr.Dataset, tuple["Measured", Misfit], list[str]]:
     """Separate, and again while what is left shows that clocks or blurs differ, or cameras move."""
-    original, (measured, misfit), late, remainder = _on_one_clock(original, once)
-    capture, motion, sentences = original, None, list[str]()
+    original, (measured, misfit), late = _on_one_clock(original, once)
+    capture, steady, sentences, remainder = original, None, list[str](), 0.0 * misfit.leak
     for _ in range(_ROUNDS):
-        steady = stabilise(original, measured.inputs, measured.result, misfit, motion)
-        retry = None if steady is None else once(steady.capture)
-        if steady is None or retry is None:
+        before = steady
+        steady = stabilise(original, measured.inputs, measured.result, misfit, before)
+        if steady is None:
             break
-        undone = retry[0].sound >= _KEPT * measured.sound
-        if undone or retry[1].size < misfit.size:  # else what changes is no motion
+        repeat = once(steady.capture)
+        undone = repeat[0].sound >= _KEPT * measured.sound
+        if undone or repeat[1].size < misfit.size:  # else what changes is no motion
             sentences = [steady.sentence(undone=undone)]
         if not undone:
             break
-        capture, motion = steady.capture, steady.motion
-        measured, misfit = retry
+        capture, (measured, misfit) = steady.capture, repeat
         remainder = np.hypot(remainder, steady.detail(measured.inputs, measured.result))
     misfit = replace(misfit, change=np.hypot(misfit.change, remainder))
     outcome = measured, misfit

@@ -26,6 +26,8 @@ WORLDS: dict[str, tuple[World, str, str]] = {
     "pointing drifts": (World(drift=(0.0, 1.0)), "image moved", "plain"),
     "1/f noise": (World(flicker=0.5), "", ""),
     "pointing and detail": (World(drift=(0.0, 1.0), detail=DETAIL), "image moved", "fine detail"),
+    "frames' levels": (World(level=(0.01, 0.1)), "level of whole frames", "plain"),
+    "level wanders": (World(wander=(0.0, 0.1)), "level of whole frames", ""),
     "fabrics": (World(fabric=(0.92, 0.80)), "", ""),
     "rough surface": (World(roughness=(2.0, 2.8)), "not equally sharp", ""),
     "second camera sharper": (World(blur=(1.2, 0.4)), "not equally sharp", ""),
@@ -66,7 +68,7 @@ WORLDS: dict[str, tuple[World, str, str]] = {
     "breathing skin": (World(breath=0.5, detail=0.003, surface=(SKIN, SKIN)), "image moved", ""),
 }
 QUICK = list(WORLDS)[:8]
-FURTHER = {"never registered": (5,), "never registered, apart": (5,)}  # seeds, beside 1 and 2
+FURTHER = {"never registered": (5, 8), "never registered, apart": (5,)}  # seeds, beside 1 and 2
 CLOCKS = [name for name in WORLDS if WORLDS[name][0].clocks]
 LEAST, FEW, MOST_RMSE, MOST_FAR = 0.9, 0.05, 1.3, 1e-3
 # By situation and seed: what is not reached.
