@@ -201,7 +201,12 @@ def _of_rows(
 
     remainder = sum(map(total, reflections, weights), np.zeros((signals.shape[1], number.size)))
     reflection = total(signals[0], np.ones(pixels.size))
-    single = _single_pixels(inputs, signals, weights, frames, place, column, number.size)
+    # The rapid changes of an object differ from pixel to pixel: they are no noise.
+    start = rows.start * width
+    divided = pixels & inputs.division[:, start : start + pixels.size].any(axis=0)
+    rapid = np.bincount(place[divided], minlength=number.size) > 0
+    films = np.where(rapid[place], reflections, signals) if rapid.any() else signals
+    single = _single_pixels(inputs, films, weights, frames, place, column, number.size)
     release()
     filled = np.maximum(number, 1.0)
     summed = [np.bincount(place[pixels], section[pixels], number.size) for section in noise]
@@ -218,7 +223,7 @@ def _of_rows(
     force = np.zeros((_WINDOWS, len(weights), frames.size))
     force[..., frames] = [precise[:, it.ravel()] @ remainder[:, it.ravel()].T for it in windows]
     form = np.array([precise[:, it.ravel()] @ weights[:, it.ravel()].T for it in windows])
-    stated = _stated(inputs, result, rows, pixels)
+    stated = _stated(result["object_temperature_std"].values[:, rows], divided)
     stated = np.bincount(place[pixels], stated[pixels], number.size) / filled
     resampled = np.any(schema.noise_factor(inputs.capture) < 1.0)
     if inputs.displacement is not None or resampled:  # neighbours share noise
@@ -285,13 +290,12 @@ def _single_pixels(
     return np.asarray(sums / np.maximum(np.bincount(place[middle], minlength=blocks), 1.0))
 
 
-def _stated(inputs: Inputs, result: xr.Dataset, rows: slice, pixels: Mask) -> Array:
+def _stated(std: Array, divided: Mask) -> Array:
     """Variance (pixel) that the deviations of objects in pieces of time hold already [K^2]."""
-    variance, start = np.zeros(pixels.size), rows.start * result.sizes["x"]
-    divided = pixels & inputs.division[:, start : start + pixels.size].any(axis=0)
+    variance = np.zeros(divided.size)
     if divided.any():
-        film = result["object_temperature_std"].values[:, rows].reshape(-1, pixels.size)
-        variance[divided] = np.nanmean(np.square(film[:, divided]), axis=0)
+        chosen = std.reshape(-1, divided.size)[:, divided]
+        variance[divided] = np.nanmean(np.square(chosen), axis=0)
     return variance
 
 

@@ -287,9 +287,11 @@ def _displacement(first: Array, second: Array, drift: Array, noise: Array) -> tu
     if finest is None:
         return none, none
     views, path, spread, alike = finest
-    # Compare what the bands do not have in common with the motion and without it.
+    # Compare what the bands do not have in common with the motion and without it: less where they
+    # show the same, and in all windows together, most of which a motion of reflections spoils.
     after, before = (np.sum(views.compared(it)[1] ** 2, axis=(0, 2)) for it in (path, none))
     explained = np.median(quotient(after[alike], before[alike], 1.0)) < _LEFT
+    explained &= after.sum() < before.sum()
     # A growth is no evidence: heat that spreads feigns it.
     sure = np.any(quotient(path**2, spread, 0.0)[:-1] > SURE)
     # No motion that is unsure, too small to matter, or does not explain the difference.
