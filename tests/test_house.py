@@ -12,7 +12,7 @@ HOUSE = Path(dbthermal.__file__).parent
 BUDGET = {
     "": (3502, 18),
     "_cli": (1244, 5),
-    "alignment": (2819, 10),
+    "alignment": (2822, 10),
     "calibration": (793, 2),
     "correction": (1726, 6),
     "emissivity": (421, 1),
@@ -22,7 +22,7 @@ BUDGET = {
     "limits": (713, 3),
     "readers": (2670, 12),
     "reporting": (393, 1),
-    "separation": (12861, 54),
+    "separation": (12858, 54),
     "simulation": (564, 2),
     "store": (1376, 6),
 }
