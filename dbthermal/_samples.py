@@ -41,8 +41,7 @@ _RANKS: Final = np.array([0.0, 0.7, 0.95])
 _DENSITY: Final = np.exp(-0.5 * ndtri(0.5 + 0.5 * _RANKS) ** 2) / np.sqrt(2.0 * np.pi)
 _MEANS: Final = -2.0 * np.diff(_DENSITY) / np.diff(_RANKS)
 _UNEQUAL: Final = 1.1
-# Ratio from which a noise contradicts the stated one; of a right one at most 1.04 in 51 scenes.
-_LARGER: Final = 1.1
+_LARGER: Final = 1.1  # ratio that contradicts a stated noise; of right ones 1.04 in 51 scenes
 _UNLIKE: Final = 20.0  # largest ratio of a motion between bands
 
 _MARGIN: Final = 1.25  # on the probability of a value, for noise that differs between pixels

@@ -85,8 +85,7 @@ def align(
         `noise_factor`, of differences of frames), `time_offset` (of each band) [s],
         `time_offset_std` [s] where the images tell it, `frames_lost` (of each band), `pauses`
         (times of the frames before and after each gap of more than 20 frame periods, in turn) [s],
-        `transform` (the matrices, row by row). Other variables over `time`, as `exposure_time` and
-        `drift`, are dropped.
+        `transform` (the matrices, row by row). Other variables over `time` are dropped.
 
     Warns
     -----

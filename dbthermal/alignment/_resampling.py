@@ -245,7 +245,6 @@ def on_one_clock(
     if not np.all([plan.valid for plan in plans], axis=0).any():
         label = f"Invalid offset {offsets.tolist()} s: it leaves no frame that all bands have"
         raise ValueError(f"{label}. Must be in seconds, and the recordings overlap.")
-    lost = [int(np.count_nonzero(~plan.valid)) for plan in plans]
     movie = _rows.lazy(aligned, counts) if lazy else counts.copy(data=aligned(slice(None)))
     result = _assembled(corrected, movie, times)
     factors = factors * schema.noise_factor(corrected)
@@ -255,7 +254,7 @@ def on_one_clock(
         clock=names[reference],
         rapid_noise_factor=rapid.tolist(),
         time_offset=offsets.tolist(),
-        frames_lost=lost,
+        frames_lost=[int(np.count_nonzero(~plan.valid)) for plan in plans],
         pauses=clocks.pauses(times).ravel().tolist(),
     )
 
@@ -283,8 +282,7 @@ def _offsets(
 def _assembled(corrected: xr.Dataset, aligned: xr.DataArray, times: Array) -> xr.Dataset:
     """Capture with the aligned counts at the times of the reference."""
     old = [name for name, variable in corrected.data_vars.items() if "time" in variable.dims]
-    result = corrected.drop_vars(set(old) - {"counts", "segment"})
-    result = result.assign(counts=aligned.variable.copy(deep=False))
+    result = corrected.drop_vars({*old} - {"counts", "segment"}).assign(counts=aligned.variable)
     attrs = schema.STAGES["corrected"]["counts"].attrs
     result["counts"].attrs = {**corrected["counts"].attrs, **attrs}
     result = result.assign_coords(time=("time", times, corrected["time"].attrs))

@@ -20,11 +20,11 @@ import numpy.typing as npt
 import xarray as xr
 from scipy.ndimage import uniform_filter
 from scipy.sparse import csr_array
+from scipy.special import chdtr, chdtri
 
 from dbthermal import _smooth as smooth
 from dbthermal import schema
-from dbthermal._arrays import Array, Mask, quotient, release
-from dbthermal._compiled import compiled
+from dbthermal._arrays import Array, Mask, parts, quotient, release
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._quality import MOST_BRIDGED
@@ -41,7 +41,9 @@ _LONG: Final = 2**25
 # Deviations of its noise from which a remainder counts; and of single pixels' means, share of their
 # noise. In plain scenes the bars stay as they are.
 _SURE, _ROUGH = 3.0, 0.1
-_MUCH: Final = 0.1  # share of the pixels whose remainders have a cause in common; plain: to 0.05
+# Share of a pixel's changes that are noise, at least, and their variance over that of all.
+_STEADY: Final = 0.8
+_OF_ALL: Final = float(chdtr(3, chdtri(1, 1.0 - _STEADY))) / _STEADY
 _MOVING: Final = 3.0  # variance of a reflection's changes in an event over their noise
 # Octaves of time in smooth functions, for the octave that is seen: 1/f noise is alike in all.
 _OCTAVES: Final = float(np.log2(smooth.HIGHEST_ORDER))
@@ -78,11 +80,6 @@ class Misfit:
         """Typical deviation of the object's signal beside a contrast of a kelvin [K]."""
         return float(np.mean(self.leak) + np.mean(self.change))
 
-    def common(self, sound: Mask) -> bool:
-        """Many pixels (y, x) without a flag have a remainder: a cause that they share."""
-        several = sound & ((self.leak > 0.0) | (self.change > 0.0))
-        return bool(np.count_nonzero(several) > _MUCH * np.count_nonzero(sound))
-
 
 class _Blocks(NamedTuple):
     """Of each block of some rows (..., row, column): averages of its pixels without a flag."""
@@ -111,15 +108,15 @@ def measure(inputs: Inputs, result: xr.Dataset, workers: int, *probes: Probe) ->
         probe: [value for value in values if value is not None]
         for probe, values in zip(probes, zip(*sums, strict=True), strict=False)
     }
+    # Changes that no reflection explains; 1/f noise of single pixels, alike in all octaves.
+    sure = _SURE * np.sqrt(2.0 / (_number(blocks) * smooth.HIGHEST_ORDER))
+    change = _excess(blocks, blocks.rough, sure, 1.0)
+    single = _excess(blocks, blocks.single, _ROUGH, _OCTAVES)
     # Give each pixel the values of its block.
-    heights = [
-        min(_BLOCK, rows.stop - top)
-        for rows in inputs.blocks
-        for top in range(rows.start, rows.stop, _BLOCK)
-    ]
-    row = np.repeat(np.arange(len(heights)), heights)
+    pairs = [(it.start, y // _BLOCK) for it in inputs.blocks for y in range(it.stop - it.start)]
+    row = np.unique(pairs, axis=0, return_inverse=True)[1].ravel()
     place = np.ix_(row, np.arange(result.sizes["x"]) // _BLOCK)
-    leak, change, single = (values(blocks)[place] for values in (_leak, _change, _single))
+    leak, change, single = (values[place] for values in (_leak(blocks), change, single))
     forms, forces = (np.concatenate(parts) for parts in zip(*common, strict=True))
     return Misfit(leak, change, single, answers, (forms, forces))
 
@@ -139,19 +136,11 @@ def _number(blocks: _Blocks) -> Array:
     return np.maximum(number, 1.0)
 
 
-def _change(blocks: _Blocks) -> Array:
-    """Deviation (row, column) [K] by changes that no reflection explains."""
-    variance, noise = _local_mean(blocks, blocks.rough)
-    freedom = _number(blocks) * smooth.HIGHEST_ORDER
+def _excess(blocks: _Blocks, variances: Array, least: Array | float, number: float) -> Array:
+    """Deviation (row, column) [K] by a number of changes that exceed so much of their noise."""
+    variance, noise = _local_mean(blocks, variances)
     more = np.maximum(variance - noise, 0.0)
-    return np.sqrt(np.where(more > _SURE * noise * np.sqrt(2.0 / freedom), more, 0.0))
-
-
-def _single(blocks: _Blocks) -> Array:
-    """Deviation (row, column) [K] by noise of single pixels, as 1/f noise, alike in all octaves."""
-    variance, noise = _local_mean(blocks, blocks.single)
-    more = np.maximum(variance - noise, 0.0)
-    return np.sqrt(np.where(more > _ROUGH * noise, _OCTAVES * more, 0.0))
+    return np.asarray(np.sqrt(np.where(more > least * noise, number * more, 0.0)))
 
 
 def _leak(blocks: _Blocks) -> Array:
@@ -188,25 +177,21 @@ def _of_rows(
     place = np.where(pixels, row // _BLOCK * shape[1] + column // _BLOCK, -1)
     number = np.bincount(place[pixels], minlength=shape[0] * shape[1]).astype(np.float64)
     # Weigh the bands, and average what is left beside the object, and the reflection.
-    deviation = inputs.noise[inputs.bands, np.newaxis] * gain
-    weights, noise = _weights(np.where(pixels, ratio, 0.5), deviation)
+    weights, noise = _weights(np.where(pixels, ratio, 0.5), inputs.noise[inputs.bands, None] * gain)
     # A span of time is an octave beyond the smooth functions, half of an event.
     length = _length(frames.size)
     event, half = np.divmod(np.flatnonzero(frames), length)
     span = np.unique(2 * event + (2 * half >= length), return_inverse=True)[1]
+    remainder, reflection = np.zeros((2, signals.shape[1], number.size))
     every, size = np.flatnonzero(pixels), (pixels.size, number.size)
-
-    def total(film: Array, weight: Array) -> Array:
-        return np.asarray(film @ csr_array((weight[pixels], (every, place[pixels])), shape=size))
-
-    remainder = sum(map(total, reflections, weights), np.zeros((signals.shape[1], number.size)))
-    reflection = total(signals[0], np.ones(pixels.size))
-    # The rapid changes of an object differ from pixel to pixel: they are no noise.
-    start = rows.start * width
-    divided = pixels & inputs.division[:, start : start + pixels.size].any(axis=0)
-    rapid = np.bincount(place[divided], minlength=number.size) > 0
-    films = np.where(rapid[place], reflections, signals) if rapid.any() else signals
-    single = _single_pixels(inputs, films, weights, frames, place, column, number.size)
+    summing, *weighing = (
+        csr_array((it[pixels], (every, place[pixels])), shape=size)
+        for it in (np.ones(pixels.size), *weights)
+    )
+    for part in parts(signals[0]):
+        remainder[part] = sum(it[part] @ w for it, w in zip(reflections, weighing, strict=True))
+        reflection[part] = signals[0][part] @ summing
+    single = _single_pixels(inputs, signals, weights, frames, place, number.size)
     release()
     filled = np.maximum(number, 1.0)
     summed = [np.bincount(place[pixels], section[pixels], number.size) for section in noise]
@@ -216,14 +201,14 @@ def _of_rows(
     remainder, reflection = remainder / filled, reflection / filled
     remainder -= basis @ (basis.T @ remainder)
     reflection -= basis @ (basis.T @ reflection)
-    # What a frame has in common, see `Misfit.levels`.
     weights = np.stack([np.bincount(place[pixels], it[pixels], number.size) for it in weights])
-    weights, precise = weights / filled, quotient(weights, noise[0] * filled, 0.0)
-    windows = np.array_split(np.arange(number.size).reshape(shape), _WINDOWS, axis=1)
-    force = np.zeros((_WINDOWS, len(weights), frames.size))
-    force[..., frames] = [precise[:, it.ravel()] @ remainder[:, it.ravel()].T for it in windows]
-    form = np.array([precise[:, it.ravel()] @ weights[:, it.ravel()].T for it in windows])
-    stated = _stated(result["object_temperature_std"].values[:, rows], divided)
+    levels = _levels(weights / filled, noise[0], remainder, frames, shape)
+    # Deviations of objects in pieces of time hold a part already.
+    stated, start = np.zeros(pixels.size), rows.start * width
+    divided = pixels & inputs.division[:, start : start + pixels.size].any(axis=0)
+    if divided.any():
+        film = result["object_temperature_std"].values[:, rows].reshape(-1, pixels.size)
+        stated[divided] = np.nanmean(np.square(film[:, divided]), axis=0)
     stated = np.bincount(place[pixels], stated[pixels], number.size) / filled
     resampled = np.any(schema.noise_factor(inputs.capture) < 1.0)
     if inputs.displacement is not None or resampled:  # neighbours share noise
@@ -243,60 +228,57 @@ def _of_rows(
         freedom,
     )
     blocks = _Blocks(*(values.reshape(*values.shape[:-1], *shape) for values in averages))
-    return blocks, (form, force)
+    return blocks, levels
+
+
+def _levels(
+    weights: Array, noise: Array, remainder: Array, frames: Mask, shape: tuple[int, int]
+) -> tuple[Array, Array]:
+    """Normal equations of what each frame has in common, see `Misfit.levels`."""
+    precise = quotient(weights, noise + 0.0 * weights, 0.0)
+    windows = np.array_split(np.arange(noise.size).reshape(shape), _WINDOWS, axis=1)
+    places = [window.ravel() for window in windows]
+    force = np.zeros((_WINDOWS, len(weights), frames.size))
+    force[..., frames] = [precise[:, it] @ remainder[:, it].T for it in places]
+    return np.array([precise[:, it] @ weights[:, it].T for it in places]), force
 
 
 def _single_pixels(
-    inputs: Inputs,
-    signals: Array,
-    weights: Array,
-    frames: Mask,
-    place: Whole,
-    column: Whole,
-    blocks: int,
+    inputs: Inputs, signals: Array, weights: Array, frames: Mask, place: Whole, blocks: int
 ) -> Array:
     """Variances (2, block) [K^2] of single pixels' means in time: measured, and of white noise."""
     # Differences of neighbours, which have the object's rapid changes in common.
-    middle = np.flatnonzero(column[:-1] % _BLOCK == 1)
+    column = np.arange(place.size - 1) % inputs.capture.sizes["x"]
+    middle = np.flatnonzero(column % _BLOCK == 1)
     alike = (place[middle - 1] == place[middle]) & (place[middle] == place[middle + 1])
     middle = middle[alike & (place[middle] >= 0)]
-    values = np.zeros((signals.shape[1], middle.size))
-    for step, part in ((-1, -1.0), (0, 2.0), (1, -1.0)):
-        pixels = middle + step
-        for film, weight in zip(signals, weights, strict=True):
-            values += part * weight[pixels] * film[:, pixels]
+    segment, length = schema.segments(inputs.capture)[frames], _length(len(frames)) // 2
+    segments = segment[: len(segment) // length * length].reshape(-1, length)
+
+    # Of the smaller changes: rapid heating, at another time in each pixel, is no noise.
+    def variance(films: Array, segments: Whole) -> Array:
+        squares = np.diff(films, 2, axis=0)[segments[:-2, 0] == segments[2:, -1]] ** 2
+        smaller = np.sort(squares, axis=0)[: int(_STEADY * len(squares))]
+        return np.asarray(smaller.sum(axis=0) / (36.0 * _OF_ALL * max(len(smaller), 1)))
+
+    def compared(middle: Whole) -> list[Array]:
+        values = np.zeros((len(segment), middle.size))
+        for pixels, share in ((middle - 1, -1.0), (middle, 2.0), (middle + 1, -1.0)):
+            for film, weight in zip(signals, weights, strict=True):
+                values += share * weight[pixels] * film[:, pixels]
+        means = values[: segments.size].reshape(*segments.shape, -1).mean(axis=1)
+        return [variance(means, segments), variance(values, segment[:, np.newaxis]) / length]
+
     # Second differences in time, too, of means over some frames and of frames; none across a
     # shutter event. Of independent noise both have 36 times its variance.
-    segment, length = schema.segments(inputs.capture)[frames], _length(len(frames)) // 2
-    number = len(values) // length
-
-    def variance(films: Array, segments: Whole) -> Array:
-        jumps = np.diff(films, 2, axis=0)[segments[:-2, 0] == segments[2:, -1]]
-        return np.asarray(np.sum(jumps**2, axis=0) / (36.0 * max(len(jumps), 1)))
-
-    groups = (array[: number * length].reshape(number, length, -1) for array in (values, segment))
-    means, segments = next(groups).mean(axis=1), next(groups)[..., 0]
-    squares = np.stack(
-        [variance(means, segments), variance(values, segment[:, np.newaxis]) / length]
-    )
+    squares = np.hstack([compared(it) for it in np.array_split(middle, _AROUND)])
     # Between frames that were interpolated in time, noise differs less than means of them tell.
-    before = inputs.noise / schema.noise_factor(inputs.capture)
-    after = before * inputs.capture.attrs.get("rapid_noise_factor", 1.0)
-    white, rapid = (
-        np.square(it[inputs.bands]) @ np.square(weights[:, middle]) for it in (before, after)
-    )
+    white = np.square(inputs.noise / schema.noise_factor(inputs.capture))
+    rapid = white * np.square(inputs.capture.attrs.get("rapid_noise_factor", 1.0))
+    white, rapid = (it[inputs.bands] @ np.square(weights[:, middle]) for it in (white, rapid))
     squares[1] *= quotient(white, rapid, 1.0)
     sums = np.stack([np.bincount(place[middle], values, blocks) for values in squares])
     return np.asarray(sums / np.maximum(np.bincount(place[middle], minlength=blocks), 1.0))
-
-
-def _stated(std: Array, divided: Mask) -> Array:
-    """Variance (pixel) that the deviations of objects in pieces of time hold already [K^2]."""
-    variance = np.zeros(divided.size)
-    if divided.any():
-        chosen = std.reshape(-1, divided.size)[:, divided]
-        variance[divided] = np.nanmean(np.square(chosen), axis=0)
-    return variance
 
 
 def read(inputs: Inputs, result: xr.Dataset, rows: slice) -> tuple[Array, Mask, Mask, Array]:
@@ -340,26 +322,12 @@ def reflected(inputs: Inputs, result: xr.Dataset, rows: slice) -> Reading:
         curve = inputs.curves[band]
         emitted = curve.signal(np.where(pixels, nodes, curve.reference)) - curve.reference
         shares = np.linalg.solve(powers, emissivity[order] * emitted)
-        _subtract(film, center, half, shares, pixels, reflections[order])
+        for part in parts(reflections[order]):
+            within, emission = (film[part] - center) / half, 0.0
+            for share in shares[::-1]:
+                emission = emission * within + share
+            np.subtract(reflections[order, part], emission, reflections[order, part], where=pixels)
     return Reading(rows, signals, reflections, frames, pixels, gain)
-
-
-@compiled
-def _subtract(
-    film: npt.NDArray[np.float32],
-    center: Array,
-    half: Array,
-    shares: Array,
-    pixels: Mask,
-    signal: Array,
-) -> None:
-    """Subtract a polynomial (power, pixel) of a film from a signal (time, pixel), in place."""
-    for t in range(len(film)):
-        for p in range(pixels.size):
-            if pixels[p]:
-                x = (film[t, p] - center[p]) / half[p]
-                value = shares[2, p] + x * shares[3, p]
-                signal[t, p] -= shares[0, p] + x * (shares[1, p] + x * value)
 
 
 def smooth_functions(inputs: Inputs, frames: Mask) -> Array:

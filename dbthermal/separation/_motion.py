@@ -13,6 +13,8 @@ hold what is expected of it, from the motion in the next octave of time. Where o
 moves slowly, its reflections h move against those of the first band, beside a delay of the clocks:
 
 .. math:: h_b / k_b - h_1 = s_b(t) \cdot \nabla h_1 + \tau(t) \, \partial_t h_1
+
+Noise c that whole frames of a band have in common is the same sum, of c for s times the gradient.
 """
 
 from collections.abc import Iterator
@@ -64,7 +66,8 @@ _POWERS, _WHITES = np.linspace(0.0, 2.0, 9), (0.0, 0.1, 1.0, 10.0)
 # counts half.
 _RATIOS: Final = np.exp(np.append(np.linspace(-1.2, -0.15, 4), np.linspace(0.15, 1.5, 9)))
 _HALF: Final = 4.0
-# Flags that motion brings about, and the share of the pixels that have them.
+# Flags that motion brings about, and the share of the pixels that have them, or a remainder: of
+# plain scenes up to 0.05 have it.
 _DISTURBED: Final = Status.OBJECT_NOT_SMOOTH | Status.OBJECT_JUMP | Status.BANDS_APART
 _MANY: Final = 0.1
 # Of slow motion: polynomials of the time, windows along a side of the image, and frames at most. As
@@ -111,9 +114,14 @@ def stabilise(
     shape, status = corrected["counts"].shape, result["status"].values
     steps, slow = np.zeros((*shape[:2], PARAMETERS)), np.zeros(PARAMETERS)
     disturbed = np.mean((status & np.uint32(_DISTURBED)) != 0) > _MANY
-    if before is None and (disturbed or misfit.common(status == 0)):
+    remainder = ((misfit.leak > 0.0) | (misfit.change > 0.0)) & (status == 0)
+    if before is None and (disturbed or remainder.sum() > _MANY * np.count_nonzero(status == 0)):
         steps = _rapid(corrected, inputs)
-        slow = _expected(inputs, steps.mean(axis=0))
+        # In the smooth functions as much motion is expected as in the next octave of time.
+        time = inputs.capture["time"].values.astype(np.float64)
+        order = min(smooth.HIGHEST_ORDER, time.size // 4)
+        octave = smooth.polynomial_basis(time, 2 * order)[:, order:]
+        slow = np.sqrt(np.sum((octave.T @ steps.mean(axis=0)) ** 2, axis=0) / time.size)
     steps[..., :2] += _slow(inputs, misfit)
     levels, wander = _levels(inputs, misfit)
     motion = steps if before is None else steps + before.motion
@@ -131,20 +139,16 @@ def stabilise(
 
 
 def _levels(inputs: Inputs, misfit: Misfit) -> tuple[Array, Array]:
-    """Levels (band, time) [K] of whole frames, and expected covariance (band, band) of slow ones.
-
-    Zero along directions, of the bands over their noise, in which frames have nothing in common.
-    """
+    """Levels (band, time) [K] of whole frames, zero without any; covariance of slow ones."""
     time, bands = inputs.capture["time"].values.astype(np.float64), inputs.bands
     form, force = misfit.levels
     shape, prior = np.diag(inputs.noise[bands]), np.eye(len(bands))
     shape = shape @ np.linalg.eigh(shape @ form.sum(axis=0) @ shape)[1]
     form, force = (shape.T @ form @ shape)[:, np.newaxis], np.swapaxes(force, 1, 2) @ shape
-    # Functions of time above the smooth ones tell whether there are levels, and of what spectrum.
+    # Functions of time above the smooth ones tell levels along directions of the bands' noise.
     first = min(smooth.HIGHEST_ORDER, time.size // 4)
     functions = smooth.polynomial_basis(time, min(8 * first, 3 * time.size // 4))[:, first:]
-    none = np.zeros((functions.shape[1], len(bands)))
-    steps, variance = jackknife(form, functions.T @ force, prior, none)
+    steps, variance = jackknife(form, functions.T @ force, prior, np.zeros((1, len(bands))))
     score = np.median(quotient(steps**2, variance, 0.0)[:first], axis=0)
     shape = shape * (score > SURE)
     levels, wander = (
@@ -158,8 +162,7 @@ def _levels(inputs: Inputs, misfit: Misfit) -> tuple[Array, Array]:
 def _below(squares: Array, first: int) -> Array:
     """Expected sum of squares below the `first` function, of those above (function, direction).
 
-    Variances are taken as A (j^-b + r) in function j: white noise, and noise that grows to slow
-    changes by up to that of a random walk, b = 2. Mean over b and r, by their likelihood.
+    Variances are A (j^-b + r) in function j: white noise to a random walk, b = 2, by likelihood.
     """
     order = np.arange(1.0, first + len(squares))
     shapes = np.array([order**-b + r * first**-b for b in _POWERS for r in _WHITES])
@@ -168,14 +171,6 @@ def _below(squares: Array, first: int) -> Array:
     likely = -0.5 * (np.log(above).sum(axis=1)[:, np.newaxis] + len(squares) * np.log(size))
     weights = np.exp(likely - likely.max(axis=0))
     return np.asarray(np.average(size * below.sum(axis=1, keepdims=True), 0, weights))
-
-
-def _expected(inputs: Inputs, path: Array) -> Array:
-    """Motion [pixel] in the smooth functions, by a path (time, ...) in the next octave."""
-    time = inputs.capture["time"].values.astype(np.float64)
-    order = min(smooth.HIGHEST_ORDER, time.size // 4)
-    octave = smooth.polynomial_basis(time, 2 * order)[:, order:]
-    return np.asarray(np.sqrt(np.sum((octave.T @ path) ** 2, axis=0) / time.size))
 
 
 class _Window(NamedTuple):
