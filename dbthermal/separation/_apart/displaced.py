@@ -30,7 +30,7 @@ from dbthermal.separation._quality import Bits
 _ROUNDS: Final = 100
 _SOLVED: Final = 1e-3
 _UNSOLVED: Final = 1e-2
-# A place so far outside of the image is still at its border, as a shift that is known may be off by
+# A place so far outside of the image is told by its border, as a shift that is known may be off by
 # so much [pixel].
 _OUTSIDE: Final = 0.2
 _LOST_WEIGHT: Final = 0.25  # weight of pixels without a value that good pixels may take over [1]
@@ -41,7 +41,8 @@ _ROWS: Final = 2**14  # rows of weights that are changed at once
 _NO_WEIGHT: Final = 1e-3  # weight below which a pixel's flags do not count [1]
 # Memory of resampled samples that are kept, for a capture is read some nine times [byte].
 _KEPT: Final = 2**29
-
+# Weights by powers of the way between two samples (R. Keys 1981, doi:10.1109/TASSP.1981.1163711).
+_KEYS: Final = 0.5 * np.array([[0, -1, 2, -1], [2, 0, -5, 3], [0, 1, 4, -3], [0, 0, -1, 1]])
 
 T = TypeVar("T")
 Paired: TypeAlias = tuple[Array, Mask, Mask, Bits, Array]
@@ -170,18 +171,16 @@ def _interpolation(place: Array, used: Mask) -> csr_array:
 
 
 def _keys(place: Array, size: int) -> tuple[npt.NDArray[np.intp], Array]:
-    """Indices and weights (4, place) of cubic convolution (Keys) along a line, held at its ends."""
-    place = np.clip(place, 0.0, size - 1.0)
-    first = np.floor(place)
-    t = place - first
-    weight = [
-        ((-0.5 * t + 1.0) * t - 0.5) * t,
-        (1.5 * t - 2.5) * t**2 + 1.0,
-        ((-1.5 * t + 2.0) * t + 0.5) * t,
-        (0.5 * t - 0.5) * t**2,
-    ]
-    index = first.astype(np.intp) + np.arange(-1, 3)[:, np.newaxis]
-    return np.clip(index, 0, size - 1), np.stack(weight)
+    """Indices and weights (4, place) of cubic convolution along a line."""
+    first = np.clip(np.floor(place), 0.0, max(size - 2.0, 0.0))
+    powers = (place - first) ** np.arange(4)[:, np.newaxis]
+    index, weight = first.astype(np.intp) + np.arange(-1, 3)[:, np.newaxis], _KEYS @ powers
+    # Beyond an end a parabola through three samples goes on, of which a slope of them is no error.
+    for outer, others in ((0, [1, 2, 3]), (3, [2, 1, 0])) if size > 2 else ():
+        outside = (index[outer] < 0) | (index[outer] >= size)
+        weight[others] += np.outer([3.0, -3.0, 1.0], weight[outer] * outside)
+        weight[outer, outside] = 0.0
+    return np.clip(index, 0, size - 1), weight
 
 
 def paired(
