@@ -87,7 +87,7 @@ class _Blocks(NamedTuple):
     pixels: Array  # their number
     noise: Array  # variances of remainder and reflection, and their covariance (3, ...) [K^2]
     rough: Array  # variance of the remainder's means in time, and its part of noise (2, ...) [K^2]
-    single: Array  # such variances of single pixels, by differences of neighbours (2, ...) [K^2]
+    single: Array  # such variances of single pixels, of all and the smaller changes (2, 2, ...)
     products: Array  # remainder times reflection, and reflection squared (2, event, ...) [K^2]
     freedom: Array  # degrees of freedom of each event (event, ...)
 
@@ -111,7 +111,7 @@ def measure(inputs: Inputs, result: xr.Dataset, workers: int, *probes: Probe) ->
     # Changes that no reflection explains; 1/f noise of single pixels, alike in all octaves.
     sure = _SURE * np.sqrt(2.0 / (_number(blocks) * smooth.HIGHEST_ORDER))
     change = _excess(blocks, blocks.rough, sure, 1.0)
-    single = _excess(blocks, blocks.single, _ROUGH, _OCTAVES)
+    single = np.minimum(*(_excess(blocks, it, _ROUGH, _OCTAVES) for it in blocks.single))
     # Give each pixel the values of its block.
     pairs = [(it.start, y // _BLOCK) for it in inputs.blocks for y in range(it.stop - it.start)]
     row = np.unique(pairs, axis=0, return_inverse=True)[1].ravel()
@@ -210,9 +210,8 @@ def _of_rows(
         film = result["object_temperature_std"].values[:, rows].reshape(-1, pixels.size)
         stated[divided] = np.nanmean(np.square(film[:, divided]), axis=0)
     stated = np.bincount(place[pixels], stated[pixels], number.size) / filled
-    resampled = np.any(schema.noise_factor(inputs.capture) < 1.0)
-    if inputs.displacement is not None or resampled:  # neighbours share noise
-        jumps = np.diff(remainder, 2, axis=0)
+    if inputs.displacement is not None or np.any(schema.noise_factor(inputs.capture) < 1.0):
+        jumps = np.diff(remainder, 2, axis=0)  # neighbours share noise
         noise[0] = np.maximum(noise[0], np.mean(jumps**2, axis=0) / 6.0)
     means = np.eye(span[-1] + 1)[span].T / np.bincount(span)[:, np.newaxis]
     leverage = np.mean(np.sum(means**2, axis=1) - np.sum((means @ basis) ** 2, axis=1))
@@ -246,7 +245,7 @@ def _levels(
 def _single_pixels(
     inputs: Inputs, signals: Array, weights: Array, frames: Mask, place: Whole, blocks: int
 ) -> Array:
-    """Variances (2, block) [K^2] of single pixels' means in time: measured, and of white noise."""
+    """Variances (2, 2, block) [K^2] of single pixels' means: measured, and of white noise."""
     # Differences of neighbours, which have the object's rapid changes in common.
     column = np.arange(place.size - 1) % inputs.capture.sizes["x"]
     middle = np.flatnonzero(column % _BLOCK == 1)
@@ -255,11 +254,12 @@ def _single_pixels(
     segment, length = schema.segments(inputs.capture)[frames], _length(len(frames)) // 2
     segments = segment[: len(segment) // length * length].reshape(-1, length)
 
-    # Of the smaller changes: rapid heating, at another time in each pixel, is no noise.
+    # Of all changes, and of the smaller: rapid heating at some time in each pixel is no noise.
     def variance(films: Array, segments: Whole) -> Array:
         squares = np.diff(films, 2, axis=0)[segments[:-2, 0] == segments[2:, -1]] ** 2
         smaller = np.sort(squares, axis=0)[: int(_STEADY * len(squares))]
-        return np.asarray(smaller.sum(axis=0) / (36.0 * _OF_ALL * max(len(smaller), 1)))
+        chosen = (squares, 36.0), (smaller, 36.0 * _OF_ALL)
+        return np.stack([it.sum(axis=0) / (times * max(len(it), 1)) for it, times in chosen])
 
     def compared(middle: Whole) -> list[Array]:
         values = np.zeros((len(segment), middle.size))
@@ -271,14 +271,14 @@ def _single_pixels(
 
     # Second differences in time, too, of means over some frames and of frames; none across a
     # shutter event. Of independent noise both have 36 times its variance.
-    squares = np.hstack([compared(it) for it in np.array_split(middle, _AROUND)])
+    squares = np.dstack([compared(it) for it in np.array_split(middle, _AROUND)]).swapaxes(0, 1)
     # Between frames that were interpolated in time, noise differs less than means of them tell.
     white = np.square(inputs.noise / schema.noise_factor(inputs.capture))
     rapid = white * np.square(inputs.capture.attrs.get("rapid_noise_factor", 1.0))
     white, rapid = (it[inputs.bands] @ np.square(weights[:, middle]) for it in (white, rapid))
-    squares[1] *= quotient(white, rapid, 1.0)
-    sums = np.stack([np.bincount(place[middle], values, blocks) for values in squares])
-    return np.asarray(sums / np.maximum(np.bincount(place[middle], minlength=blocks), 1.0))
+    squares[:, 1] *= quotient(white, rapid, 1.0)
+    sums = [[np.bincount(place[middle], it, blocks) for it in kinds] for kinds in squares]
+    return np.array(sums) / np.maximum(np.bincount(place[middle], minlength=blocks), 1.0)
 
 
 def read(inputs: Inputs, result: xr.Dataset, rows: slice) -> tuple[Array, Mask, Mask, Array]:
