@@ -90,12 +90,12 @@ def empty(shape: tuple[int, ...], dtype: npt.DTypeLike) -> npt.NDArray[Any]:
 def copied(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Copy an array."""
     result = empty(values.shape, values.dtype)
-    for rows in parts(values):
+    for rows in stretches(values):
         result[rows] = values[rows]
     return result
 
 
-def parts(film: npt.NDArray[Any]) -> Iterator[slice]:
+def stretches(film: npt.NDArray[Any]) -> Iterator[slice]:
     """Yield places along the first axis of a film, whose pages are given back after each."""
     step = max(1, _PART * len(film) // max(1, film.nbytes))
     for start in range(0, len(film), step):

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from dbthermal._arrays import Array, Mask, parts
+from dbthermal._arrays import Array, Mask, stretches
 from dbthermal._compiled import compiled
 
 Whole = npt.NDArray[np.intp]
@@ -247,7 +247,7 @@ def _arnoldi(position: Array, order: int) -> Array:
 def bridge(film: npt.NDArray[Any], pixels: Mask) -> npt.NDArray[Any]:
     """Fill missing samples of some pixels of a film (time, pixel) by lines, in place; return it."""
     last = np.full(pixels.size, -1)
-    for frames in parts(film):
+    for frames in stretches(film):
         _bridge(film, frames.start, min(frames.stop, len(film)), pixels, last)
     # A curve ends as its last number.
     for pixel in np.flatnonzero(pixels & (last >= 0) & (last < len(film) - 1)):

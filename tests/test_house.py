@@ -12,7 +12,7 @@ HOUSE = Path(dbthermal.__file__).parent
 BUDGET = {
     "": (3510, 18),
     "_cli": (1257, 5),
-    "alignment": (2822, 10),
+    "alignment": (2825, 10),
     "calibration": (793, 2),
     "correction": (1726, 6),
     "emissivity": (421, 1),
@@ -22,7 +22,7 @@ BUDGET = {
     "limits": (713, 3),
     "readers": (2663, 10),
     "reporting": (392, 1),
-    "separation": (12866, 54),
+    "separation": (12863, 54),
     "simulation": (563, 2),
     "store": (1376, 6),
 }

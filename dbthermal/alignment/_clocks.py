@@ -89,6 +89,13 @@ class Interpolation:
         shape = self.valid.size, self.stamps.size
         return csr_array((weights[wanted, place], (wanted, frames[wanted, place])), shape=shape)
 
+    def noise_factors(self) -> tuple[float, float]:
+        """Independent noise over that before, of frames and of their second differences [1]."""
+        weights = self.matrix()[self.valid]
+        twice = weights[2:] - 2.0 * weights[1:-1] + weights[:-2]
+        square = (weights**2).sum() / max(weights.shape[0], 1)
+        return float(square**0.5), float(((twice**2).sum() / max(6 * twice.shape[0], 1)) ** 0.5)
+
     def labels(self, segment: Whole) -> Whole:
         """Segment (wanted) of each interpolated frame, from those of the samples (time)."""
         return np.where(self.weight == 1, segment[self.after], segment[self.before])

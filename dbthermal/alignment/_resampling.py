@@ -223,10 +223,7 @@ def on_one_clock(
         plan.valid[plan.labels(segment) != segment] = False
         shown = np.stack([signals[it, :, ::thin] for it in (reference, band)])
         plans.append(lags.bent(plan, shown, times, segment, np.sqrt(3.0) * steps * noise[band]))
-        matrix = plans[band].matrix()[plan.valid]  # of independent noises
-        factors[band] = np.sqrt((matrix**2).sum() / max(plan.valid.sum(), 1))
-        twice = matrix[2:] - 2.0 * matrix[1:-1] + matrix[:-2]
-        rapid[band] = np.sqrt((twice**2).sum() / max(6 * twice.shape[0], 1))
+        factors[band], rapid[band] = plans[band].noise_factors()
 
     def aligned(rows: slice) -> Movie:
         """Counts of some rows at the times of the reference."""
@@ -247,12 +244,11 @@ def on_one_clock(
         raise ValueError(f"{label}. Must be in seconds, and the recordings overlap.")
     movie = _rows.lazy(aligned, counts) if lazy else counts.copy(data=aligned(slice(None)))
     result = _assembled(corrected, movie, times)
-    factors = factors * schema.noise_factor(corrected)
-    rapid *= corrected.attrs.get("rapid_noise_factor", 1.0)
+    factors *= schema.noise_factor(corrected)
     result = result.assign(noise_factor=("band", factors, schema.NOISE_FACTOR.attrs))
     return result.assign_attrs(
         clock=names[reference],
-        rapid_noise_factor=rapid.tolist(),
+        rapid_noise_factor=(rapid * corrected.attrs.get("rapid_noise_factor", 1.0)).tolist(),
         time_offset=offsets.tolist(),
         frames_lost=[int(np.count_nonzero(~plan.valid)) for plan in plans],
         pauses=clocks.pauses(times).ravel().tolist(),

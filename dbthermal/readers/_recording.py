@@ -18,7 +18,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import _numbers, _text, schema
-from dbthermal._arrays import Array, empty, made_on_disk, parts
+from dbthermal._arrays import Array, empty, made_on_disk, stretches
 from dbthermal._warnings import warned
 from dbthermal.readers._formats import PNG
 
@@ -118,7 +118,7 @@ def damage_named(label: str, rule: str) -> Iterator[None]:
 
 def check_present(counts: Counts, fills: Sequence[Any], name: str) -> None:
     """Raise ValueError where counts are values that stand for missing ones."""
-    if fills and any(np.isin(counts[at], fills).any() for at in parts(counts)):
+    if fills and any(np.isin(counts[at], fills).any() for at in stretches(counts)):
         raise ValueError(f"Missing counts in '{name}': {[*map(float, fills)]}. Must all be there.")
 
 
@@ -146,7 +146,7 @@ def check_pieces(number: int, size: int, label: str) -> None:
 def film(values: Any) -> Counts:
     """Counts (time, y, x) of an array, which must be as it declares, copied frames at a time."""
     counts = empty(values.shape, np.dtype(values.dtype).newbyteorder("="))
-    for frames in parts(counts):
+    for frames in stretches(counts):
         block, place = values[frames], counts[frames]
         block = block.compute() if hasattr(block, "compute") else block  # NumPy alone loses a mask
         block = block.data if isinstance(block, xr.DataArray) else block

@@ -11,7 +11,7 @@ import xarray as xr
 from scipy.constants import zero_Celsius
 
 from dbthermal import _numbers, schema
-from dbthermal._arrays import empty, parts
+from dbthermal._arrays import empty, stretches
 from dbthermal._text import shown
 from dbthermal._warnings import warned
 from dbthermal.readers._recording import FileFlag
@@ -92,7 +92,7 @@ def two_bands(
     # No two recordings may have the same counts, as of a file that is named twice.
     overlapping = [recording["counts"].values[: min(lengths)] for recording in cameras]
     for film, other_film in combinations(overlapping, 2):
-        if all(np.array_equal(film[at], other_film[at]) for at in parts(film)):
+        if all(np.array_equal(film[at], other_film[at]) for at in stretches(film)):
             label = f"Same counts in both recordings, of the bands {names}"
             raise ValueError(f"{label}. Must be those of two cameras: is one file named twice?")
     # Frames of all; shorter recordings are filled up, and flagged.
@@ -101,7 +101,7 @@ def two_bands(
     flags = np.full(counts.shape[:2], FileFlag.PADDED.value, dtype=np.uint16)
     for place, (recording, shift) in enumerate(zip(cameras, shifts, strict=True)):
         length = recording.sizes["time"]
-        for at in parts(recording["counts"].values):
+        for at in stretches(recording["counts"].values):
             counts[place, :length][at] = recording["counts"].values[at]
         counts[place, length:] = recording["counts"].values[-1]
         times[place, :length] = recording["exposure_time"].values + shift

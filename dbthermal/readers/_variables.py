@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from dbthermal._arrays import empty, parts
+from dbthermal._arrays import empty, stretches
 from dbthermal.readers import _recording as recordings
 
 _NUMPY_HEADER: Final = 2**16  # of NumPy's format, at most [byte]
@@ -68,7 +68,7 @@ class Stream(Unread):
     def counts(self) -> npt.NDArray[Any]:
         """Counts, which must end where the header says."""
         counts, size = empty(self.shape[:: -1 if self.by_columns else 1], np.uint16), 0
-        for frames in parts(counts):
+        for frames in stretches(counts):
             size += self.stream.readinto(counts[frames].view("u1").data)  # type: ignore[attr-defined]
             if not self.dtype.isnative:
                 counts[frames].byteswap(inplace=True)

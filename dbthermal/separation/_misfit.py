@@ -24,7 +24,7 @@ from scipy.special import chdtr, chdtri
 
 from dbthermal import _smooth as smooth
 from dbthermal import schema
-from dbthermal._arrays import Array, Mask, parts, quotient, release
+from dbthermal._arrays import Array, Mask, quotient, release, stretches
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._quality import MOST_BRIDGED
@@ -117,7 +117,7 @@ def measure(inputs: Inputs, result: xr.Dataset, workers: int, *probes: Probe) ->
     row = np.unique(pairs, axis=0, return_inverse=True)[1].ravel()
     place = np.ix_(row, np.arange(result.sizes["x"]) // _BLOCK)
     leak, change, single = (values[place] for values in (_leak(blocks), change, single))
-    forms, forces = (np.concatenate(parts) for parts in zip(*common, strict=True))
+    forms, forces = map(np.concatenate, zip(*common, strict=True))
     return Misfit(leak, change, single, answers, (forms, forces))
 
 
@@ -182,25 +182,23 @@ def _of_rows(
     length = _length(frames.size)
     event, half = np.divmod(np.flatnonzero(frames), length)
     span = np.unique(2 * event + (2 * half >= length), return_inverse=True)[1]
-    remainder, reflection = np.zeros((2, signals.shape[1], number.size))
+    sums = np.zeros((2, signals.shape[1], number.size))
     every, size = np.flatnonzero(pixels), (pixels.size, number.size)
     summing, *weighing = (
         csr_array((it[pixels], (every, place[pixels])), shape=size)
         for it in (np.ones(pixels.size), *weights)
     )
-    for part in parts(signals[0]):
-        remainder[part] = sum(it[part] @ w for it, w in zip(reflections, weighing, strict=True))
-        reflection[part] = signals[0][part] @ summing
+    for chunk in stretches(signals[0]):
+        sums[0, chunk] = sum(it[chunk] @ w for it, w in zip(reflections, weighing, strict=True))
+        sums[1, chunk] = signals[0][chunk] @ summing
     single = _single_pixels(inputs, signals, weights, frames, place, number.size)
     release()
     filled = np.maximum(number, 1.0)
-    summed = [np.bincount(place[pixels], section[pixels], number.size) for section in noise]
-    noise = np.stack(summed) / filled**2
+    noise = np.stack([np.bincount(place[pixels], it[pixels], number.size) for it in noise])
     # Take the smooth functions out, and sum over means and events.
     basis = smooth_functions(inputs, frames)
-    remainder, reflection = remainder / filled, reflection / filled
-    remainder -= basis @ (basis.T @ remainder)
-    reflection -= basis @ (basis.T @ reflection)
+    noise, sums = noise / filled**2, sums / filled
+    remainder, reflection = sums - basis @ (basis.T @ sums)
     weights = np.stack([np.bincount(place[pixels], it[pixels], number.size) for it in weights])
     levels = _levels(weights / filled, noise[0], remainder, frames, shape)
     # Deviations of objects in pieces of time hold a part already.
@@ -234,7 +232,7 @@ def _levels(
     weights: Array, noise: Array, remainder: Array, frames: Mask, shape: tuple[int, int]
 ) -> tuple[Array, Array]:
     """Normal equations of what each frame has in common, see `Misfit.levels`."""
-    precise = quotient(weights, noise + 0.0 * weights, 0.0)
+    precise = quotient(weights, noise, 0.0)
     windows = np.array_split(np.arange(noise.size).reshape(shape), _WINDOWS, axis=1)
     places = [window.ravel() for window in windows]
     force = np.zeros((_WINDOWS, len(weights), frames.size))
@@ -322,11 +320,11 @@ def reflected(inputs: Inputs, result: xr.Dataset, rows: slice) -> Reading:
         curve = inputs.curves[band]
         emitted = curve.signal(np.where(pixels, nodes, curve.reference)) - curve.reference
         shares = np.linalg.solve(powers, emissivity[order] * emitted)
-        for part in parts(reflections[order]):
-            within, emission = (film[part] - center) / half, 0.0
+        for chunk in stretches(reflections[order]):
+            within, emission = (film[chunk] - center) / half, 0.0
             for share in shares[::-1]:
                 emission = emission * within + share
-            np.subtract(reflections[order, part], emission, reflections[order, part], where=pixels)
+            reflections[order, chunk] -= np.where(pixels, emission, 0.0)
     return Reading(rows, signals, reflections, frames, pixels, gain)
 
 

@@ -223,8 +223,7 @@ def _mended(
     original, (measured, misfit), late = _on_one_clock(original, once)
     capture, steady, sentences, remainder = original, None, list[str](), 0.0 * misfit.leak
     for _ in range(_ROUNDS):
-        before = steady
-        steady = stabilise(original, measured.inputs, measured.result, misfit, before)
+        steady = stabilise(original, measured.inputs, measured.result, misfit, steady)
         if steady is None:
             break
         repeat = once(steady.capture)

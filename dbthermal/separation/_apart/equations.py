@@ -14,7 +14,7 @@ from scipy.special import chdtri
 
 from dbthermal import _smooth as smooth
 from dbthermal import schema
-from dbthermal._arrays import Array, parts
+from dbthermal._arrays import Array, stretches
 from dbthermal.response import Curve
 from dbthermal.separation import _quality as quality
 from dbthermal.separation._apart import relaxation
@@ -192,7 +192,7 @@ def of_material(inputs: Inputs, raw: Floats, material: Material) -> tuple[Floats
 def measured(film: Floats) -> Mask:
     """Pixels of a film (frame, pixel) with a number in some frame."""
     result = np.zeros(film.shape[1], dtype=bool)
-    for frames in parts(film):
+    for frames in stretches(film):
         result |= np.isfinite(film[frames]).any(axis=0)
     return result
 
