@@ -30,8 +30,10 @@ PARAMETERS: Final = 4
 SURE: Final = 20.0
 # Functions of time in which an object changes, the mean among them; in which reflections do, too;
 # and energy of the second kind over that of the first, at most, in a window: 0.01 to 0.1 of an
-# object's detail, 0.2 or more of people who walk by slowly.
-_ORDER, _HIGHEST, _RAPID = 3, 8, 0.1
+# object's detail, 0.2 or more of people who walk by slowly. A lamp that is switched is as slow, but
+# the largest energy of more functions is 0.23 of the first kind or more in all of its windows, and
+# at most 0.18 in half of an object's.
+_ORDER, _HIGHEST, _RAPID, _ALL, _LAMP = 3, 8, 0.1, 16, 0.2
 _SIDE, _DEGREE = 10, 3  # of a window [pixel], and of the polynomial that is smooth in it
 _BLURS: Final = (2.0, 1.0, 0.5)  # deviations, from coarse to fine [pixel]
 # Whole displacements [pixel] that are tried first, along an axis; and what of the most in common
@@ -189,13 +191,13 @@ def overlay(corrected: xr.Dataset, inputs: Inputs) -> Laid | None:
 def _slow_maps(corrected: xr.Dataset, inputs: Inputs, frames: Whole) -> tuple[Array, Array]:
     """Maps (band, function, y, x) [K] of slow functions of time in some frames; their drift."""
     counts, good = corrected["counts"], inputs.good
-    course = smooth.polynomial_basis(corrected["time"].values[frames], _HIGHEST)
+    course = smooth.polynomial_basis(corrected["time"].values[frames], _ALL)
     slow = course[:, :_ORDER]
     # What a drift along time brings of each (..., function) into the functions without the mean.
     drift = (slow[:, 1:] * slow[:, [1]]).T @ slow / np.abs(slow[:, 1]).max()
     weights, span = course.T.astype(np.float32), slice(frames[0], frames[-1] + 1)
     used = span if span.stop - span.start == frames.size else frames
-    maps = np.zeros((len(inputs.bands), _HIGHEST, *good.shape))
+    maps = np.zeros((len(inputs.bands), _ALL, *good.shape))
     for rows in inputs.blocks:
         films = counts[:, used, rows].values
         for rise, band in zip(maps, inputs.bands, strict=True):
@@ -260,17 +262,20 @@ class _Views:
 
 def _displacement(first: Array, second: Array, drift: Array, noise: Array) -> tuple[Array, Array]:
     """Motion (parameter) [pixel] that lays maps (function, y, x) on the first, and its variance."""
+    none = np.zeros(PARAMETERS)
     # Choose the windows of most detail, which changes as the object does: all in slow functions.
     height, width = (size // _SIDE for size in first.shape[1:])
     corners = np.indices((height, width)).reshape(2, -1, 1) * _SIDE
     pixels = corners + np.indices((_SIDE, _SIDE)).reshape(2, 1, -1)
     smoothed = gaussian_filter(first[1:], _BLURS[0], axes=(1, 2))
     energy = np.sum(_detail(smoothed[:, *pixels]) ** 2, axis=2)
-    slow, rapid = (np.mean(planes, axis=0) for planes in np.split(energy, [_ORDER - 1]))
-    pixels = pixels[:, rapid < _RAPID * slow]
-    most = np.argsort(slow[rapid < _RAPID * slow])[-_MOST:]
+    slow, rapid = energy[: _ORDER - 1].mean(axis=0), energy[_ORDER - 1 :]
+    used = rapid[: _HIGHEST - _ORDER].mean(axis=0) < _RAPID * slow
+    if np.count_nonzero(used & (rapid.max(axis=0) < _LAMP * slow)) < _FEWEST:
+        return none, none
+    pixels, most = pixels[:, used], np.argsort(slow[used])[-_MOST:]
     first, second = first[:_ORDER], second[:_ORDER]
-    path, none, finest = np.zeros(PARAMETERS), np.zeros(PARAMETERS), None
+    path, finest = none, None
     # From coarse detail to fine, as far as both bands show it.
     for blur in _BLURS:
         views = _Views(first, second, drift, pixels[:, most], blur)

@@ -14,6 +14,7 @@ Floats = npt.NDArray[np.floating[Any]]
 # Steps of the iteration, and the change that ends it [K].
 _STEPS: Final = 60
 CONVERGED: Final = 1e-3
+_ENDLESS: Final = 1e3  # change of an object between two places [K] that no iteration ended at
 
 Rows: TypeAlias = tuple[Whole, Whole, Floats]
 """Starts of the rows, columns and values of a sparse matrix."""
@@ -64,8 +65,7 @@ def _at_p(terms: Terms, pixel: int, signal: Floats, film: Floats) -> None:
             film[t] = signal[pixel, t] + change[t]
         return
     starts, columns, values = terms.there
-    for t in range(film.size):
-        film[t] = 0.0
+    film[:] = 0.0
     for entry in range(starts[pixel], starts[pixel + 1]):
         weight, beside = values[entry], signal[columns[entry]]
         for t in range(film.size):
@@ -91,18 +91,16 @@ def _backward(
     terms: Terms, target: Floats, pixel: int, signal: Floats, film: Floats, spare: Floats
 ) -> None:
     """Next u_1(x(r)) (frame) [K] of a pixel by the equation at p + d(p), in place."""
-    place, slope = terms.place[pixel], 0.0
+    place = terms.place[pixel]
     starts, columns, values = terms.onward
-    for t in range(film.size):
-        film[t] = 0.0
+    film[:] = 0.0
     for entry in range(starts[place], starts[place + 1]):
         weight, beyond = values[entry], columns[entry]
         first = terms.shares[0, beyond]
         for t in range(film.size):
             film[t] += weight * (target[beyond, t] - first * signal[beyond, t])
     _other_bands(terms.beyond, place, terms.bends, signal[pixel], spare)
-    for band in range(len(terms.beyond)):
-        slope += terms.beyond[band, place]
+    slope = terms.beyond[:, place].sum()
     for t in range(film.size):
         film[t] = signal[pixel, t] + (film[t] - spare[t]) / slope
 
@@ -138,20 +136,17 @@ def second_place(terms: Terms, target: Floats, signal: Floats, result: Floats) -
         _at_p(terms, pixel, signal, film)
         if terms.way[pixel] == BACKWARD:
             # Its own equation holds for another x(p) than that between its neighbours.
-            slope = 0.0
-            for band in range(len(second)):
-                slope += second[band, pixel]
+            slope = second[:, pixel].sum()
             _other_bands(second, pixel, terms.bends, film, spare)
             for t in range(film.size):
                 left = target[pixel, t] - terms.shares[0, pixel] * signal[pixel, t] - spare[t]
                 film[t] += left / slope
-        for t in range(film.size):
-            result[pixel, t] = film[t]
+        result[pixel] = film
 
 
 @compiled
 def changes(signals: Floats, pixels: Whole, shares: Floats, bend: Floats, result: Floats) -> None:
-    """Shares (pixel) of the change of u_m, of u_1 at both places (2, node, pixel), in place."""
+    """Shares (pixel) of the change of u_m, of u_1 at both places (2, node, pixel), 0 if endless."""
     for t in range(result.shape[0]):
         for p in range(pixels.size):
             at_r, at_p = np.float64(signals[0, t, pixels[p]]), np.float64(signals[1, t, pixels[p]])
@@ -159,4 +154,4 @@ def changes(signals: Floats, pixels: Whole, shares: Floats, bend: Floats, result
             for degree in range(bend.size - 1, -1, -1):
                 of_r, of_p = of_r * at_r + bend[degree], of_p * at_p + bend[degree]
             change = shares[p] * (change + of_p - of_r)
-            result[t, p] = 0.0 if np.isnan(change) else change
+            result[t, p] = change if abs(change) < _ENDLESS else 0.0  # nor NaN
