@@ -6,11 +6,10 @@ the messages and states of a wheel as its maker does, such as ``MOT_MOVE_HOME`` 
 
 import math
 import struct
-from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 
@@ -19,13 +18,7 @@ from dbthermal.instruments import boson
 from dbthermal.instruments._apt import Id
 from dbthermal.instruments.boson import Boson
 from dbthermal.instruments.emulated import World
-from dbthermal.instruments.emulated.devices import (
-    Drive,
-    EmulatedApt,
-    EmulatedBoson,
-    EmulatedTC08,
-    Numbers,
-)
+from dbthermal.instruments.emulated.devices import Drive, EmulatedApt, EmulatedBoson, EmulatedTC08
 from dbthermal.instruments.filterwheel import BSC10X, FilterWheel, Settings, StatusBits
 from dbthermal.instruments.tc08 import TC08
 from dbthermal.instruments.transport import EmulatedClock
@@ -46,7 +39,8 @@ class WheelFaults:
     stray_completed: bool = False  # a report of the end of some move before every answer
     unreported: bool = False  # the end of a move is not reported
     long_reports: bool = False  # reports of an end have the status behind, as 20 bytes
-    stuck: str = ""  # states that it always reports, joined by |
+    stuck: str = ""  # states that it reports whatever it does, joined by |
+    stuck_from: float = 0.0  # time from when it does [s]
     slow: float = 1.0  # factor by which moves take longer
     stands_after: float = math.inf  # way after which the counter stands, trying on [deg]
     stops_short: float = 0.0  # way that remains when a move is said to be over [deg]
@@ -58,18 +52,18 @@ class WheelFaults:
 
 @dataclass(frozen=True)
 class StandingDrive(Drive):
-    """A motion that never ends."""
+    """A motion that stands after a way [count], and never ends."""
 
     way: float = 0.0
 
     @property
     def duration(self) -> float:
-        """Infinite: the motion never ends."""
+        """Infinite."""
         return math.inf
 
     def place(self, time: float) -> float:
-        """Position at rest: the wheel does not move."""
-        way = min(self._rise(time - self.start), self.way)
+        """Place at a time [count]."""
+        way = min(abs(super().place(time) - self.origin), self.way)
         return self.origin + math.copysign(way, self.distance)
 
 
@@ -159,14 +153,15 @@ class FaultyApt(EmulatedApt):
         )
         if faults.stands_after * degree >= way:
             return planned
-        values = {entry.name: getattr(planned, entry.name) for entry in fields(Drive)}
-        return StandingDrive(**values, way=faults.stands_after * degree)
+        return StandingDrive(**vars(planned), way=faults.stands_after * degree)
 
     def status(self) -> apt.Status:
         """State with bits that stick."""
-        status = super().status()
-        stuck = [StatusBits[name] for name in self.faults.stuck.split("|") if name]
-        return status._replace(bits=status.bits | sum(stuck))
+        status, faults = super().status(), self.faults
+        if not faults.stuck or self.clock() < faults.stuck_from:
+            return status
+        stuck = sum(StatusBits[name] for name in faults.stuck.split("|"))
+        return status._replace(bits=status.bits | stuck)
 
 
 def request(
@@ -185,119 +180,25 @@ def text(sequence: int, command: int) -> bytes:
     return request(sequence, command, b"emulated debug text", 0, channel=0x99)
 
 
-class FaultyBoson(EmulatedBoson):
-    """The emulated camera that falls silent after some answers, or while its shutter is closed."""
-
-    def __init__(self, world: World, name: str) -> None:
-        super().__init__(world, name)
-        self.answers, self.stalls = math.inf, False
-        self._inbox: deque[boson.Packet] = deque()
-
-    def request(self, frame: boson.Packet) -> None:
-        """Take in one request, to be answered when the shutter is open."""
-        self.answers -= 1
-        if self.answers >= 0:
-            self._inbox.append(frame)
-
-    def poll(self) -> list[bytes]:
-        """Give the replies that are due."""
-        replies = []
-        while self._inbox and self.next_due() <= 0:
-            replies.append(self.reply(self._inbox.popleft()))
-        return replies
-
-    def next_due(self) -> float:
-        """Time until a reply is due [s]; infinite without a request."""
-        if not self._inbox:
-            return math.inf
-        return self.camera.ffc_until - self.clock() if self.stalls else 0.0
-
-
-@dataclass
-class LoggerFaults:
-    """Faults of the logger and its library; may be changed at any time."""
-
-    open: set[int] = field(default_factory=set)  # channels whose thermocouple is open: NaN
-    overflow: set[int] = field(default_factory=set)  # channels whose converter overflows
-    errors: dict[str, int] = field(default_factory=dict)  # next error number of a function
-    firmware_delay: float = 0.0  # how long opening takes [s]
-    no_unit: bool = False  # nothing is plugged in
-    unplugged: bool = False  # pulled out: every function fails with error 16
-
-
-class FaultyTC08(EmulatedTC08):
-    """The emulated library with faults."""
-
-    def __init__(self, tip: Callable[[int], float], clock: Any) -> None:
-        super().__init__(tip, clock)
-        self.faults = LoggerFaults()
-        self._opening = 0.0
-
-    def __getattribute__(self, name: str) -> Any:
-        """Give a function of the library, or one that fails."""
-        if name.startswith("usb_tc08_") and name != "usb_tc08_get_last_error":
-            code = 16 if self.faults.unplugged else self.faults.errors.pop(name, 0)
-            if code:
-                self.error = code
-                return lambda *_: -1 if name.endswith("progress") else 0
-        return super().__getattribute__(name)
-
-    def usb_tc08_open_unit_async(self) -> int:
-        """Begin the firmware's download."""
-        self._opening = self.clock()
-        return super().usb_tc08_open_unit_async()
-
-    def usb_tc08_open_unit_progress(self, handle: Numbers, percent: Numbers) -> int:
-        """Wait for the firmware."""
-        if self.clock() - self._opening < self.faults.firmware_delay:
-            return 0
-        self.is_open |= self.faults.no_unit
-        return super().usb_tc08_open_unit_progress(handle, percent)
-
-    def convert(self, channel: int) -> tuple[float, bool]:
-        """Open thermocouples, and overflows with a full scale that the header leaves open [K]."""
-        if channel in self.faults.overflow:
-            return 673.15, True
-        if channel in self.faults.open:
-            return float("nan"), False
-        return super().convert(channel)
-
-
 FILTERS = {1: "open", 3: "9.5", 5: "LW"}
 QUICK = Settings(velocity=50.0, home_velocity=20.0, acceleration=1e3)
 """A wheel that turns in no time."""
 
 
-class Clock(EmulatedClock):
-    """Emulated time from a start [s], with things to do at some times [s]."""
-
-    def __init__(self, now: float = 100.0) -> None:
-        super().__init__()
-        super().sleep(now)
-        self.events: list[tuple[float, Callable[[], None]]] = []
-
-    @property
-    def now(self) -> float:
-        """The time [s]."""
-        return self()
-
-    def sleep(self, seconds: float) -> None:
-        """Let time pass [s], and do what is due."""
-        super().sleep(seconds)
-        due = [event for event in self.events if event[0] <= self()]
-        for event in due:
-            self.events.remove(event)
-            event[1]()
+def clock_at(time: float) -> EmulatedClock:
+    """Emulated clock that is at a time [s]."""
+    (clock := EmulatedClock()).sleep(time)
+    return clock
 
 
 class BosonBench:
     """An emulated camera and its driver, on one clock."""
 
     def __init__(self, serial_number: int = 93588) -> None:
-        self.clock = Clock()
+        self.clock = clock_at(100.0)
         self.world = World(clock=self.clock)
         self.state = self.world.add_camera("boson", serial_number)
-        self.device = FaultyBoson(self.world, "boson")
+        self.device = EmulatedBoson(self.world, "boson")
         self.camera = Boson(self.device, first_sequence=1)
 
     def exchange(self, request: bytes) -> bytes:
@@ -310,8 +211,8 @@ class WheelBench:
     """An emulated wheel and its driver, on one simulated clock."""
 
     def __init__(self, model: str = "BSC201", slot_offset: float = 0.0, **options: object) -> None:
-        self.clock = Clock(0.0)
-        self.world = World(clock=self.clock, filters=FILTERS, wheel_position=4)
+        self.world = World(filters=FILTERS, wheel_position=4)
+        self.clock = self.world.clock
         self.device = FaultyApt(self.world, model=model, slot_offset=slot_offset)
         chosen = Settings(**options)  # type: ignore[arg-type]
         self.wheel = FilterWheel(self.device, FILTERS, chosen)
@@ -327,10 +228,17 @@ class LoggerBench:
     """A driver on an emulated unit, a clock, and tips whose temperatures a test sets."""
 
     def __init__(self) -> None:
-        self.clock = Clock(1000.0)
+        self.clock = clock_at(1000.0)
         self.tips = {1: 350.0, 2: 300.0}
-        self.unit = FaultyTC08(lambda channel: self.tips.get(channel, np.nan), self.clock)
+        self.unit = EmulatedTC08(lambda channel: self.tips.get(channel, np.nan), self.clock)
         self.driver = TC08(self.unit)
+
+    def fail(self, code: int, *functions: str) -> None:
+        """Let functions of the library fail with an error number from now on."""
+        self.unit.error = code
+        for name in functions:
+            failing = Mock(return_value=-1 if name.endswith("progress") else 0)
+            setattr(self.unit, f"usb_tc08_{name}", failing)
 
     def ready(self) -> TC08:
         """Open the unit with two thermocouples of type T."""

@@ -230,14 +230,14 @@ def test_a_camera_corrects_its_offsets(opened: Opened) -> None:
 def test_a_camera_keeps_a_mode(opened: Opened) -> None:
     """The FFC mode is set and read back; an unknown mode raises a ValueError."""
     camera: Boson = opened.device
-    before = camera.get(boson.FFC_MODE)
+    before = camera.read(boson.FFC_MODE)
     camera.set(boson.FFC_MODE, FfcMode.MANUAL)
-    assert camera.get(boson.FFC_MODE) is FfcMode.MANUAL
+    assert camera.read(boson.FFC_MODE) is FfcMode.MANUAL
     wrong: Any = 4
     with pytest.raises(ValueError, match="Invalid FFC mode 4"):
         camera.set(boson.FFC_MODE, wrong)
     camera.set(boson.FFC_MODE, before)
-    assert camera.get(boson.FFC_MODE) is before
+    assert camera.read(boson.FFC_MODE) is before
 
 
 @opens(*WHEELS)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
 from faulty_devices import BosonBench, LoggerBench
 from rig_session import TEXT, bench, from_yaml, pictures, replaced, rig
@@ -77,9 +78,9 @@ def test_prepared_for_a_measurement(devices: Devices) -> None:
     devices.prepare()
     for camera in devices.cameras.values():
         assert isinstance(camera, Boson)
-        assert camera.get(boson.IR16_MODE) == Ir16Mode.COUNTS_16
-        assert camera.get(boson.FFC_MODE) == FfcMode.MANUAL
-        assert camera.get(boson.TELEMETRY) == Switch.ON
+        assert camera.read(boson.IR16_MODE) == Ir16Mode.COUNTS_16
+        assert camera.read(boson.FFC_MODE) == FfcMode.MANUAL
+        assert camera.read(boson.TELEMETRY) == Switch.ON
         assert camera.ffc_status() == FfcStatus.COMPLETE
     assert devices.wheel is not None
     assert devices.world is not None
@@ -97,7 +98,7 @@ class Kept(dict[int, int]):
 def test_setting_that_is_not_taken_is_an_error() -> None:
     """A camera that acknowledges a setting but does not change raises an error."""
     bench = BosonBench()
-    bench.device.settings = Kept({**bench.device.settings, boson.IR16_MODE.set_command: 2})
+    bench.device.settings = Kept({**bench.device.settings, boson.IR16_MODE.command: 2})
     message = r"Invalid IR16 mode .*TLINEAR.* of camera 93588, set to .*COUNTS_16.* Must be"
     with pytest.raises(ValueError, match=message):
         Devices(from_yaml(TEXT), {}, {"9.5": bench.camera}).prepare()
@@ -143,8 +144,9 @@ def test_one_scan_gives_all_channels_once() -> None:
     assert [read(2, 2.0), read(2, 3.0)] == [302.0, 303.0]
     bench.clock.sleep(1.1)  # the value that was not read yet is too old
     assert read(1, 4.0) == 354.0
-    for fault in ("open", "overflow"):
-        vars(bench.unit.faults).update({"open": set(), "overflow": set(), fault: {2}})
+    for fault, tip in (("open", (np.nan, False)), ("overflow", (673.15, True))):
+        convert = {1: (354.0, False), 2: tip}.get
+        vars(bench.unit)["convert"] = lambda channel, tips=convert: tips(channel, (296.15, False))
         bench.clock.sleep(1.1)
         with pytest.raises(ReadingError, match=f"thermocouple 'room' in channel 2: {fault}. Must"):
             thermocouples.read(2)

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from dialogue import Dialogue, Pair
-from faulty_devices import FILTERS, WheelBench
+from faulty_devices import FILTERS, WheelBench, WheelFaults
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -51,21 +51,24 @@ def test_every_slot_turns_into_the_beam(model: str) -> None:
     assert max(order.index(0x0210), order.index(0x0440)) < order.index(0x0443)  # enabled, then home
 
 
+@pytest.fixture
+def bench() -> WheelBench:
+    """A bench whose wheel was homed."""
+    (bench := WheelBench()).homed()
+    return bench
+
+
 @pytest.mark.parametrize("turns", [-1, 1])
-def test_slots_of_any_turn(turns: int) -> None:
+def test_slots_of_any_turn(bench: WheelBench, turns: int) -> None:
     """A wheel that was turned on, by a whole turn and a sixth, has the next slot in the beam."""
-    bench = WheelBench()
-    wheel = bench.homed()
     bench.device.turn_to(turns * (409_600 + 68_267))
     bench.clock.sleep(30.0)
-    assert wheel.position() == bench.world.wheel_position == (2 if turns > 0 else 6)
+    assert bench.wheel.position() == bench.world.wheel_position == (2 if turns > 0 else 6)
 
 
-def test_filters_are_called_by_their_band() -> None:
+def test_filters_are_called_by_their_band(bench: WheelBench) -> None:
     """The band that is selected is the one that the world's camera then sees."""
-    bench = WheelBench()
-    wheel = bench.homed()
-    wheel.select("9.5")
+    (wheel := bench.wheel).select("9.5")
     assert (wheel.band(), bench.world.filter_name) == ("9.5", "9.5")
     with pytest.raises(ValueError, match=r"Invalid band 'MW' .* one of \['9.5', 'LW', 'open'\]"):
         wheel.select("MW")
@@ -80,16 +83,14 @@ def test_filters_are_called_by_their_band() -> None:
     assert later.band() == "LW"
 
 
-def test_a_wheel_that_turns_or_rests_between_two_slots() -> None:
+def test_a_wheel_that_turns_or_rests_between_two_slots(bench: WheelBench) -> None:
     """It has no position and no filter in the beam, and is moved again once it was stopped."""
-    bench = WheelBench()
-    wheel = bench.homed()
     bench.device.turn_to(200_000)
     assert bench.world.wheel_position is None
     with pytest.raises(WheelError, match="still moving"):
-        wheel.position()
+        bench.wheel.position()
     bench.clock.sleep(0.5)
-    wheel.stop()
+    (wheel := bench.wheel).stop()
     with pytest.raises(WheelError, match=r"between two slots, at .* deg"):
         wheel.position()
     wheel.move_to(2)
@@ -99,14 +100,11 @@ def test_a_wheel_that_turns_or_rests_between_two_slots() -> None:
 def test_home_is_as_the_settings_say() -> None:
     """Direction and switch are sent; an offset of slot 1 is undone, and not detected if wrong."""
     bench = WheelBench(home_direction=1, home_limit_switch=4)
-    bench.homed().move_to(2)
-    assert struct.unpack("<HHHii", bench.device.sent("MOT_SET_HOMEPARAMS")[-1])[1:3] == (1, 4)
-    assert bench.world.wheel_position == 2
     right, wrong = WheelBench(slot_offset=12.5, home_offset=12.5), WheelBench(slot_offset=12.5)
-    right.homed().move_to(2)
-    wrong.homed().move_to(2)
-    assert right.world.wheel_position == right.wheel.position() == 2
-    assert (wrong.world.wheel_position, wrong.wheel.position()) == (None, 2)
+    for turned, slot in ((bench, 2), (right, 2), (wrong, None)):
+        turned.homed().move_to(2)
+        assert (turned.world.wheel_position, turned.wheel.position()) == (slot, 2)
+    assert struct.unpack("<HHHii", bench.device.sent("MOT_SET_HOMEPARAMS")[-1])[1:3] == (1, 4)
 
 
 def test_a_wheel_that_is_not_homed() -> None:
@@ -142,6 +140,12 @@ def status(position: int, bits: int) -> bytes:
     return bytes.fromhex("81 04 0e 00 81 21") + data
 
 
+def connected(dialogue: Dialogue) -> FilterWheel:
+    """A wheel at the end of a dialogue, once it is connected."""
+    (wheel := FilterWheel(dialogue, FILTERS)).connect()
+    return wheel
+
+
 def test_dialogue_of_a_move() -> None:
     """Every byte of a connection and a move, with the report of the end between two answers."""
     move = bytes.fromhex("53 04 06 00 A1 01 01 00 AB 0A 01 00")
@@ -153,8 +157,7 @@ def test_dialogue_of_a_move() -> None:
         (ASK, status(68_267, 0x80000500)),
     ]
     with Dialogue([*PAIRS, *talk]) as dialogue:
-        wheel = FilterWheel(dialogue, FILTERS)
-        wheel.connect()
+        wheel = connected(dialogue)
         assert wheel.identity()["model"] == "BSC201"
         wheel.move_to(2)
 
@@ -167,9 +170,7 @@ def test_answers_of_others() -> None:
     enabled: Pair = (PAIRS[-1][0], [bytes.fromhex("12 02 01 01 01 21"), old])
     talk: Pair = (ASK, [other_bay + other_channel, answer])
     with Dialogue([*PAIRS[:-1], enabled, talk]) as dialogue:
-        wheel = FilterWheel(dialogue, FILTERS)
-        wheel.connect()
-        assert wheel.status().position == 3
+        assert connected(dialogue).status().position == 3
 
 
 BANNER = b"Command error CMD_NOT_DEFINED\r\n> "  # of an FW102C
@@ -188,7 +189,7 @@ STATES: list[Pair] = [(PAIRS[-1][0], bytes((0x12, 2, 1, state, 1, 0x21))) for st
 def test_answers_that_are_none(pairs: list[Pair], message: str) -> None:
     """Text, and a motor that is neither enabled nor not, raise an error on connecting."""
     with Dialogue(pairs) as dialogue, pytest.raises(WheelError, match=message):
-        FilterWheel(dialogue, FILTERS).connect()
+        connected(dialogue)
 
 
 class Babbler(Dialogue):
@@ -202,12 +203,10 @@ class Babbler(Dialogue):
 @given(st.lists(st.binary(max_size=40), max_size=6))
 def test_arbitrary_answers(answers: list[bytes]) -> None:
     """Connecting ends with a documented error for arbitrary answers, also if they never end."""
-    babbler = Babbler([(None, answers)] if answers else [])
     with pytest.raises(WheelError):
-        FilterWheel(babbler, FILTERS).connect()
-    endless = Babbler([(None, [bytes(256)] * 513)])
+        connected(Babbler([(None, answers)] if answers else []))
     with pytest.raises(WheelError, match="More than 65536 unsolicited bytes came"):
-        FilterWheel(endless, {}).connect()
+        connected(Babbler([(None, [bytes(256)] * 513)]))
 
 
 Case = tuple[dict[str, Any], type[WheelError], str]
@@ -249,14 +248,12 @@ def test_controllers_that_are_refused(
     ],
     ids=lambda faults: next(iter(faults)),
 )
-def test_harmless_faults(faults: dict[str, object]) -> None:
+def test_harmless_faults(bench: WheelBench, faults: dict[str, object]) -> None:
     """Split, merged, late, missing, unasked and noisy answers: the wheel is where it should be."""
-    bench = WheelBench()
-    wheel = bench.homed()
     vars(bench.device.faults).update(faults)
     for position in (3, 6, 2):
-        wheel.move_to(position)
-        assert bench.world.wheel_position == position == wheel.position()
+        bench.wheel.move_to(position)
+        assert bench.world.wheel_position == position == bench.wheel.position()
 
 
 # Of a move to slot 3: fault, error, its text, if the wheel is stopped, and must then be homed.
@@ -275,18 +272,21 @@ STALLS: list[tuple[dict[str, Any], type[WheelError], str, bool, bool]] = [
 
 @pytest.mark.parametrize(("faults", "error", "message", "stopped", "lost"), STALLS)
 def test_moves_that_fail(
-    faults: dict[str, Any], error: type[WheelError], message: str, stopped: bool, lost: bool
+    bench: WheelBench,
+    faults: dict[str, Any],
+    error: type[WheelError],
+    message: str,
+    stopped: bool,
+    lost: bool,
 ) -> None:
     """A move that fails is an error in bounded time; where steps may be lost, home comes first."""
-    bench = WheelBench()
-    wheel, healthy = bench.homed(), dict(vars(bench.device.faults))
-    vars(bench.device.faults).update(faults)
-    before = bench.clock.now
+    wheel, before = bench.wheel, bench.clock()
+    bench.device.faults = WheelFaults(**faults)
     with pytest.raises(error, match=message):
         wheel.move_to(3)
-    assert bench.clock.now - before < 30.0
+    assert bench.clock() - before < 30.0
     assert bool(bench.device.sent("MOT_MOVE_STOP")) == stopped
-    vars(bench.device.faults).update(healthy)
+    bench.device.faults = WheelFaults()
     if lost:
         with pytest.raises(NotHomedError, match="lost steps"):
             wheel.move_to(1)
@@ -303,37 +303,30 @@ def test_moves_that_fail(
     ],
 )
 def test_searches_for_home_that_fail(
-    faults: dict[str, Any], error: type[WheelError], message: str
+    bench: WheelBench, faults: dict[str, Any], error: type[WheelError], message: str
 ) -> None:
     """Neither the state nor the report of an earlier search counts, and the position is lost."""
-    bench = WheelBench()
-    wheel = bench.homed()
-    wheel.move_to(4)
+    (wheel := bench.wheel).move_to(4)
     bench.device.receive(bytes.fromhex("43 04 01 00 21 01"))  # a search that no driver follows
     bench.clock.sleep(10.0)
     wheel.status()
     wheel.move_to(4)
-    vars(bench.device.faults).update(faults)
+    bench.device.faults = WheelFaults(**faults)
     with pytest.raises(error, match=message):
         wheel.home()
-    bench.device.faults.deaf_to = ""
+    bench.device.faults = WheelFaults()
     wheel.stop()
     with pytest.raises(NotHomedError, match="Must be homed"):
         wheel.position()
 
 
-def test_moving_bits_that_stick() -> None:
+def test_moving_bits_that_stick(bench: WheelBench) -> None:
     """With stuck motion bits a move ends by its report, and the next move raises an error."""
-    bench = WheelBench()
-    wheel = bench.homed()
-    stick = {"stuck": "MOVING_FORWARD"}
-    bench.clock.events.append(
-        (bench.clock.now + 0.3, lambda: vars(bench.device.faults).update(stick))
-    )
-    wheel.move_to(3)
+    bench.device.faults = WheelFaults(stuck="MOVING_FORWARD", stuck_from=bench.clock() + 0.3)
+    bench.wheel.move_to(3)
     assert bench.world.wheel_position == 3
     with pytest.raises(WheelError, match="still moving"):
-        wheel.move_to(4)
+        bench.wheel.move_to(4)
 
 
 def test_errors_of_the_greeting_are_logged_and_forgotten(caplog: pytest.LogCaptureFixture) -> None:
@@ -348,10 +341,9 @@ def test_errors_of_the_greeting_are_logged_and_forgotten(caplog: pytest.LogCaptu
         bench.wheel.home()
 
 
-def test_answers_that_come_too_late(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_answers_that_come_too_late(bench: WheelBench, monkeypatch: pytest.MonkeyPatch) -> None:
     """Answers later than the limit may be those of an older question: never a wrong slot."""
-    bench, patient = WheelBench(), WheelBench()
-    wheel = bench.homed()
+    patient, wheel = WheelBench(), bench.wheel
     bench.device.faults.late = patient.device.faults.late = 1.2
     wheel.move_to(3)
     assert bench.world.wheel_position == wheel.position() == 3
@@ -367,12 +359,11 @@ def test_answers_that_come_too_late(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_noise_on_the_line(noise: bytes, drop: int) -> None:
     """With any bytes before every answer, and some missing: the right slot, or a known error."""
     bench = WheelBench()
-    bench.device.faults.noise = noise
-    bench.device.faults.drop = drop
+    bench.device.faults = WheelFaults(noise=noise, drop=drop)
     try:
         bench.homed().move_to(2)
     except WheelError:
-        assert bench.clock.now < 200.0
+        assert bench.clock() < 200.0
     else:
         assert bench.world.wheel_position == 2
 

@@ -22,7 +22,7 @@ from dbthermal.instruments.camera import Counts, Frame, FrameFlag, FrameSource
 from dbthermal.instruments.emulated import World
 from dbthermal.instruments.recording import Limits, Preview, Reading, notes, open_capture, record
 from dbthermal.instruments.session import Camera, Session
-from dbthermal.instruments.transport import EmulatedClock
+from dbthermal.instruments.transport import Clock, EmulatedClock
 
 SHAPE, RATE, CHUNK = (16, 24), 100.0, 5
 SMALL = Limits(chunk=CHUNK, reserve=0, silence=0.1, reading_period=0.05, preview_period=0.0)
@@ -40,16 +40,10 @@ def session(duration: float = 0.3) -> Session:
     return two_bands(duration, SHAPE, RATE)
 
 
-def bench(
-    first: Faults | None = None,
-    second: Faults | None = None,
-    *,
-    rows: int = 0,
-    world: World | None = None,
-) -> dict[str, FrameSource]:
+def bench(*faults: Faults, rows: int = 0, world: World | None = None) -> dict[str, FrameSource]:
     """Two cameras on one bench, with their faults."""
-    faults = dict(zip(BANDS, (first or Faults(), second or Faults()), strict=True))
-    return dict(two_cameras(picture, SHAPE, RATE, rows, faults=faults, world=world))
+    by_band = dict(zip(BANDS, faults, strict=bool(faults)))
+    return dict(two_cameras(picture, SHAPE, RATE, rows, faults=by_band, world=world))
 
 
 def written(path: Path) -> int:
@@ -248,9 +242,7 @@ def interrupt(_: Preview | None = None) -> None:
 class HastyClock(EmulatedClock):
     """Emulated time in which no camera waits for the disk."""
 
-    def has_room(self, room: threading.Semaphore) -> bool:
-        """Take a place in a buffer; False if it is full."""
-        return room.acquire(blocking=False)
+    has_room = Clock.has_room
 
 
 def slow_disk(monkeypatch: pytest.MonkeyPatch, world: World) -> None:
@@ -326,7 +318,8 @@ def test_keyboard_interrupt_keeps_everything(
 
 def test_a_camera_that_gives_nothing_is_told(tmp_path: Path) -> None:
     """A camera without a frame makes the recording incomplete, and its silence is in the log."""
-    sources, path = bench(None, Faults(mute=True)), tmp_path / "a.zarr"
+    sources, path = bench(world=(world := World())), tmp_path / "a.zarr"
+    world.camera("9.5").phase = 1e9  # its first frame is far off
     summary = record(session(), sources, path, limits=SMALL)
     assert (summary.ended, summary.totals["9.5"]["frames"]) == ("no frames", 0)
     assert store.open_dataset(path).attrs["complete"] is False

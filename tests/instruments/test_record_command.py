@@ -24,7 +24,6 @@ ONE = replaced(
     ("window: 3", "window: 0.1"),
     ("0.15", "0.6"),  # a reading takes a third of it
 )
-REAL = TEXT.replace("simulated: true", "simulated: false").replace("/dev/", "/dev/none/")
 
 
 @pytest.fixture(autouse=True)
@@ -96,28 +95,16 @@ def test_what_is_made_of_a_recording_is_none(tmp_path: Path) -> None:
         open_capture(folder / "aligned.zarr")
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("name: plate", "Missing 'simulated'. Must be set"),
-        (TEXT.replace("tc08:", "tc09:"), "Invalid address 'tc09:'. Must be tc08:"),
-        (TEXT.replace("v4l2:///dev/video0", "v4l2:///tmp/x"), "Must be v4l2:///dev/<node>"),
-        (REAL, "/dev/none/"),
-    ],
-)
-def test_failures_have_a_status(
-    text: str,
-    message: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+def test_a_missing_device_has_a_status(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A failure prints its message, after the report of the bus, with the documented status."""
+    """It is named with the documented status, after the report of the bus."""
     monkeypatch.setattr(inventory, "find", lambda **_: [])
-    assert run(tmp_path, text) == 1
+    real = TEXT.replace("simulated: true", "simulated: false").replace("/dev/", "/dev/none/")
+    assert run(tmp_path, real) == 1
     said = capsys.readouterr()
-    assert message in said.err
-    assert (inventory.describe([]) in said.out) is (text is REAL)
+    assert "/dev/none/" in said.err
+    assert inventory.describe([]) in said.out
 
 
 def test_what_is_refused_at_once(
