@@ -356,8 +356,7 @@ class Boson(Closing):
         for _ in range(repeats + 1):
             with self._clock.hold(self._lock):
                 self._sequence = next_sequence(self._sequence)
-                number, status = self._sequence, REQUEST
-                request = Packet(COMMAND_CHANNEL, number, command, status, data)
+                request = Packet(COMMAND_CHANNEL, self._sequence, command, REQUEST, data)
                 self._transport.write(encode(request))
                 if reply := self._reply(name):
                     break

@@ -91,14 +91,13 @@ def two_cameras(
     *,
     faults: Mapping[str, Faults] | None = None,
     world: World | None = None,
-    kind: type[FaultyCamera] = FaultyCamera,
 ) -> dict[str, FaultyCamera]:
     """Two emulated cameras on one bench that see one picture, with the faults of each band."""
     world, sources = world or World(), {}
     for number, band in enumerate(BANDS):
         world.add_camera(band, 100 + number)
-        form, faults_by_band = (band, {band: picture}, band, shape, rate, rows), faults or {}
-        sources[band] = kind(world, *form, faults=faults_by_band.get(band, Faults()))
+        form, fault = (band, {band: picture}, band, shape, rate, rows), (faults or {}).get(band)
+        sources[band] = FaultyCamera(world, *form, faults=fault or Faults())
     return sources
 
 

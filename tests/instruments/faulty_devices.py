@@ -30,7 +30,6 @@ _ENDS = {Id.MOT_MOVE_COMPLETED, Id.MOT_MOVE_STOPPED, Id.MOT_MOVE_HOMED}  # of a 
 class WheelFaults:
     """Faults of the wheel and its line; may be changed at any time."""
 
-    silent: bool = False  # answers nothing
     drop: int = 0  # next answers that never come
     late: float = 0.0  # delay of every answer [s]
     single_bytes: bool = False  # every byte in a piece of its own
@@ -44,7 +43,7 @@ class WheelFaults:
     slow: float = 1.0  # factor by which moves take longer
     stands_after: float = math.inf  # way after which the counter stands, trying on [deg]
     stops_short: float = 0.0  # way that remains when a move is said to be over [deg]
-    deaf_to: str = ""  # name of the message that it ignores
+    deaf_to: str = ""  # name of the message that it ignores, or "all"
     weak: float = 1.0  # factor of the speeds that it takes
     notice: str = ""  # error that it reports at the next message, once
     polls: float = math.inf  # after which it is pulled out
@@ -95,7 +94,7 @@ class FaultyApt(EmulatedApt):
         """Carry out a message, or ignore it by a fault."""
         self.received.append(message)
         faults = self.faults
-        if faults.silent or (faults.deaf_to and message.id == Id[faults.deaf_to]):
+        if faults.deaf_to in {"all", Id(message.id).name}:
             return
         if faults.notice:
             notice = struct.pack("<HH64s", message.id, 1, faults.notice.encode())

@@ -14,14 +14,7 @@ from hypothesis import strategies as st
 from test_codecs import FRAMES
 
 from dbthermal.instruments import boson
-from dbthermal.instruments.boson import (
-    REPLY_TIMEOUT,
-    Boson,
-    BosonError,
-    BosonTimeoutError,
-    Reading,
-    Setting,
-)
+from dbthermal.instruments.boson import Boson, BosonError, BosonTimeoutError, Reading
 from dbthermal.instruments.camera import FfcStatus, GainMode
 from dbthermal.instruments.emulated import FFC_DURATION, World
 from dbthermal.instruments.emulated.devices import EmulatedBoson
@@ -92,7 +85,7 @@ def numbered(names: str) -> dict[str, int]:
 def test_every_setting_is_kept(bench: BosonBench, name: str) -> None:
     """Every value is sent, and read back as set, and so is each reading; another is refused."""
     (command, members), setting = SETTINGS[name], FOUND[name]
-    assert isinstance(setting, Setting)
+    assert isinstance(setting, boson.Setting)
     kind: Any = setting.convert
     assert {value.name: value.value for value in kind} == numbered(members)
     for value in kind:
@@ -249,7 +242,7 @@ def test_a_correction_that_takes_too_long_is_an_error(bench: BosonBench, answers
     vars(bench.device)["receive"] = lambda data: next(remaining, -1) < 0 or receive(data)
     with pytest.raises(BosonTimeoutError, match=r"No flat-field correction within 0\.2 s"):
         bench.camera.run_ffc(timeout=0.2)
-    assert bench.clock() - start <= 0.2 + REPLY_TIMEOUT + 0.2
+    assert bench.clock() - start <= 0.2 + boson.REPLY_TIMEOUT + 0.2
 
 
 def test_each_program_begins_at_another_number() -> None:

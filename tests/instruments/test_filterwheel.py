@@ -215,7 +215,7 @@ REFUSED: list[Case] = [
     ({"deaf_to": "MOT_SET_HOMEPARAMS"}, WheelError, "home velocity 0. Must be 4397466"),
     ({"deaf_to": "MOD_SET_CHANENABLESTATE"}, WheelError, "did not enable the motor"),
     ({"weak": 0.98}, WheelError, r"The controller has velocity \d+\. Must be 21987328"),
-    ({"silent": True}, NoReplyError, "No APT controller answered at 0x11, 0x50. It must be"),
+    ({"deaf_to": "all"}, NoReplyError, "No APT controller answered at 0x11, 0x50. It must be"),
     ({"model": "KDC101"}, WheelError, "Wrong device 'KDC101', number 40000000"),
     ({"serial_number": 7}, WheelError, "Wrong controller 40000000. Must be 7"),
 ]
@@ -265,7 +265,7 @@ STALLS: list[tuple[dict[str, Any], type[WheelError], str, bool, bool]] = [
     ({"deaf_to": "MOT_MOVE_ABSOLUTE"}, StalledWheelError, "did not start and is at 0", False, True),
     ({"stuck": "OVERLOAD"}, StalledWheelError, "OVERLOAD, and the wheel was stopped", True, True),
     ({"slow": 30.0}, WheelError, "deg after 20.0 s, and was stopped", True, False),
-    ({"silent": True}, NoReplyError, "must be on and in no other program's use", False, False),
+    ({"deaf_to": "all"}, NoReplyError, "must be on and in no other program's use", False, False),
     ({"notice": "motor hot"}, WheelError, "error 1 of message 0x0480: motor hot", False, False),
 ]
 

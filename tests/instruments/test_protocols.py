@@ -26,7 +26,6 @@ from dbthermal import store
 from dbthermal.instruments import protocols, recording
 from dbthermal.instruments.camera import SourceLostError
 from dbthermal.instruments.devices import Devices
-from dbthermal.instruments.emulated import World
 from dbthermal.instruments.recording import Preview, Summary, notes, open_capture
 from dbthermal.instruments.transport import EmulatedClock
 
@@ -35,15 +34,9 @@ ONE = replaced(("[300.0, 290.0, 310.0]", "[300.0]"), QUICKLY)
 TWO = replaced(("[300.0, 290.0, 310.0]", "[300.0, 290.0], accuracy: 0.05"), QUICKLY)
 
 
-def world_of(devices: Devices) -> World:
-    """World of emulated devices."""
-    assert isinstance(devices.world, World)
-    return devices.world
-
-
 def faulty(devices: Devices, band: str, faults: Faults) -> Devices:
     """The devices with a camera that has faults."""
-    world, form = world_of(devices), (None, SHAPE, 100.0, 2)
+    world, form = devices.world, (None, SHAPE, 100.0, 2)
     camera = FaultyCamera(world, band, pictures(world), *form, faults=faults)
     return replace(devices, sources={**devices.sources, band: camera})
 
@@ -57,9 +50,8 @@ def swept(
     """Sweep a blackbody that is at once where it is set."""
 
     def set_temperature(value: float) -> None:
-        world_of(devices).blackbody_temperature = value
-        if log is not None:
-            log.append(value)
+        devices.world.blackbody_temperature = value
+        (log if log is not None else []).append(value)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(protocols, "STABILITY_PERIOD", 0.01)
@@ -160,7 +152,7 @@ def test_interrupted_sweep_goes_on(tmp_path: Path) -> None:
         assert steps[0].totals["8-14"]["frames"] > 8
         assert swept(devices, tmp_path, log) == steps
         # Offsets are corrected before the sweep, and at each temperature that is recorded.
-        assert {camera.ffc_count for camera in world_of(devices).cameras.values()} == {4}
+        assert {camera.ffc_count for camera in devices.world.cameras.values()} == {4}
     new_plan = from_yaml(replaced(("[300.0, 290.0, 310.0]", "[301.0, 290.0]")))
     with rig(new_plan) as devices, pytest.raises(ValueError, match=r"Must be of 301\.0 K"):
         swept(devices, tmp_path)
@@ -179,7 +171,7 @@ def test_a_step_must_be_of_one_state(tmp_path: Path) -> None:
 
         def drift(_: Preview) -> None:
             if (tmp_path / "plate_00_11.zarr").exists():
-                world_of(devices).blackbody_temperature = 300.5
+                devices.world.blackbody_temperature = 300.5
 
         swept(devices, tmp_path, preview=drift)
         with pytest.raises(ValueError, match=r"Invalid readings \[300.*\] K of 'blackbody'"):

@@ -2,6 +2,7 @@
 
 import ctypes
 import errno
+import mmap
 import struct
 import sys
 from dataclasses import dataclass, field, replace
@@ -28,16 +29,6 @@ BYTES = 2 * 6 * 6
 GOOD = 0x12000  # stamp of the monotonic clock, of the start of exposure
 
 
-class Memory(bytearray):
-    """Mapped memory that can be closed."""
-
-    closed = False
-
-    def close(self) -> None:
-        """Close as of `mmap.mmap`."""
-        self.closed = True
-
-
 @dataclass
 class Driver:
     """Stands in for the kernel: a node with a format, a rate and frames to give."""
@@ -48,7 +39,7 @@ class Driver:
     rate: int = 60
     answers: list[tuple[int, int, int, int]] = field(default_factory=list)
     calls: list[int] = field(default_factory=list)
-    maps: list[Memory] = field(default_factory=list)
+    maps: list[mmap.mmap] = field(default_factory=list)
     queued: list[int] = field(default_factory=list)
     files: set[int] = field(default_factory=set)  # that are open
     lost: int = 0
@@ -70,9 +61,9 @@ class Driver:
         self.files.add(3)
         return 3
 
-    def _map(self, file: int, length: int, offset: int) -> Memory:
+    def _map(self, file: int, length: int, offset: int) -> mmap.mmap:
         assert (file, offset) == (3, 4096 * len(self.maps))
-        self.maps.append(Memory(length))
+        self.maps.append(mmap.mmap(-1, length))
         return self.maps[-1]
 
     def _ioctl(self, file: int, number: int, argument: bytearray) -> int:
