@@ -28,7 +28,7 @@ from typing import Any, Final, Generic, TypeVar
 from scipy.constants import zero_Celsius
 
 from dbthermal.instruments import telemetry, v4l2
-from dbthermal.instruments.camera import CameraKind, FfcMode, FfcStatus, GainMode, Identity
+from dbthermal.instruments.camera import CameraKind, FfcStatus, Identity
 from dbthermal.instruments.transport import Closing, Transport
 
 __all__ = ["KIND", "Boson", "BosonError", "BosonTimeoutError"]
@@ -57,26 +57,20 @@ T = TypeVar("T")
 EnumT = TypeVar("EnumT", bound=IntEnum)
 
 
-class Switch(IntEnum):
-    """State of a function."""
+Switch = IntEnum("Switch", "OFF ON", start=0)
+"""State of a function."""
 
-    OFF = 0
-    ON = 1
+FfcMode = IntEnum("FfcMode", "MANUAL AUTO EXTERNAL SHUTTER_TEST", start=0)
+"""Trigger of a flat-field correction; if it is external the shutter stays open before the scene."""
 
+GainMode = IntEnum("GainMode", "HIGH LOW AUTO DUAL MANUAL", start=0)
+"""Sensitivity; low gain has the larger range of temperatures."""
 
-class Ir16Mode(IntEnum):
-    """Content of the 16-bit USB video: counts, counts of 14 bits, or scaled temperature."""
+Ir16Mode = IntEnum("Ir16Mode", "COUNTS_16 COUNTS_14 TLINEAR", start=0)
+"""Content of the 16-bit USB video: counts, counts of 14 bits, or scaled temperature."""
 
-    COUNTS_16 = 0
-    COUNTS_14 = 1
-    TLINEAR = 2
-
-
-class TelemetryLocation(IntEnum):
-    """Place of the telemetry rows: before the image or after it."""
-
-    TOP = 0
-    BOTTOM = 1
+TelemetryLocation = IntEnum("TelemetryLocation", "TOP BOTTOM", start=0)
+"""Place of the telemetry rows: before the image or after it."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from test_codecs import FRAMES
 
 from dbthermal.instruments import boson
 from dbthermal.instruments.boson import Boson, BosonError, BosonTimeoutError, Reading
-from dbthermal.instruments.camera import FfcStatus, GainMode
+from dbthermal.instruments.camera import FfcStatus
 from dbthermal.instruments.emulated import FFC_DURATION, World
 from dbthermal.instruments.emulated.devices import EmulatedBoson
 from dbthermal.instruments.transport import SYSTEM, TransportError
@@ -171,7 +171,7 @@ def test_a_change_is_sent_once(answer: bytes | None, error: type[BosonError], me
     """A command that changes the camera is never sent twice, and answered without data."""
     line = Dialogue([(request(1, SET_GAIN, b"\x00\x00\x00\x01"), answer)])
     with line, pytest.raises(error, match=message):
-        camera_of(line).set(boson.GAIN_MODE, GainMode.LOW)
+        camera_of(line).set(boson.GAIN_MODE, boson.GainMode.LOW)
 
 
 blobs = st.lists(st.binary(max_size=60), max_size=6)

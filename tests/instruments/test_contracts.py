@@ -23,7 +23,6 @@ from test_v4l2 import BYTES, GOOD, STREAM, Driver
 from dbthermal.instruments import boson, filterwheel, inventory, v4l2
 from dbthermal.instruments.boson import BAUDRATE, Boson
 from dbthermal.instruments.camera import (
-    FfcMode,
     FfcStatus,
     FrameSource,
     NoFrameError,
@@ -231,8 +230,8 @@ def test_a_camera_keeps_a_mode(opened: Opened) -> None:
     """The FFC mode is set and read back; an unknown mode raises a ValueError."""
     camera: Boson = opened.device
     before = camera.read(boson.FFC_MODE)
-    camera.set(boson.FFC_MODE, FfcMode.MANUAL)
-    assert camera.read(boson.FFC_MODE) is FfcMode.MANUAL
+    camera.set(boson.FFC_MODE, boson.FfcMode.MANUAL)
+    assert camera.read(boson.FFC_MODE) is boson.FfcMode.MANUAL
     wrong: Any = 4
     with pytest.raises(ValueError, match="Invalid FFC mode 4"):
         camera.set(boson.FFC_MODE, wrong)

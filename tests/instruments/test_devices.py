@@ -8,8 +8,8 @@ from faulty_devices import BosonBench, LoggerBench
 from rig_session import TEXT, bench, from_yaml, pictures, replaced, rig
 
 from dbthermal.instruments import boson
-from dbthermal.instruments.boson import Boson, Ir16Mode, Switch
-from dbthermal.instruments.camera import FfcMode, FfcStatus
+from dbthermal.instruments.boson import Boson, FfcMode, Ir16Mode, Switch
+from dbthermal.instruments.camera import FfcStatus
 from dbthermal.instruments.devices import Devices, open_devices
 from dbthermal.instruments.filterwheel import NotHomedError
 from dbthermal.instruments.tc08 import ReadingError

@@ -25,7 +25,7 @@ from scipy.constants import zero_Celsius
 
 from dbthermal.instruments import _apt, boson
 from dbthermal.instruments._apt import Id
-from dbthermal.instruments.camera import FfcMode, FfcStatus
+from dbthermal.instruments.camera import FfcStatus
 from dbthermal.instruments.emulated import ROOM, World
 from dbthermal.instruments.filterwheel import BSC20X, StatusBits
 from dbthermal.instruments.session import WHEEL
@@ -109,7 +109,7 @@ class EmulatedBoson(Line):
         self.camera = world.camera(name)
         # At power-on, by the identifier that reads them; not those of a real camera.
         self.settings = {setting.command: 0 for setting in boson.SETTINGS}
-        self.settings[boson.FFC_MODE.command] = int(FfcMode.AUTO)
+        self.settings[boson.FFC_MODE.command] = int(boson.FfcMode.AUTO)
         self._name, self._decoder = name, boson.Decoder()
 
     @property
