@@ -56,7 +56,6 @@ _CHECKSUM = struct.Struct(">H")
 T = TypeVar("T")
 EnumT = TypeVar("EnumT", bound=IntEnum)
 
-
 Switch = IntEnum("Switch", "OFF ON", start=0)
 """State of a function."""
 
