@@ -1,12 +1,12 @@
 """Emulated wheel, camera and logger with faults, and their drivers on a simulated clock.
 
-The tests speak to the emulated devices in bytes that `request`, `reply` and `text` make, and name
-the messages and states of a wheel as its maker does, such as ``MOT_MOVE_HOME`` and ``OVERLOAD``.
+The tests speak to the emulated devices in bytes that `request` and `reply` make, and name the
+messages and states of a wheel as its maker does, such as ``MOT_MOVE_HOME`` and ``OVERLOAD``.
 """
 
 import math
 import struct
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 from unittest.mock import Mock
@@ -18,7 +18,7 @@ from dbthermal.instruments import boson
 from dbthermal.instruments._apt import Id
 from dbthermal.instruments.boson import Boson
 from dbthermal.instruments.emulated import World
-from dbthermal.instruments.emulated.devices import Drive, EmulatedApt, EmulatedBoson, EmulatedTC08
+from dbthermal.instruments.emulated.devices import EmulatedApt, EmulatedBoson, EmulatedTC08
 from dbthermal.instruments.filterwheel import BSC10X, FilterWheel, Settings, StatusBits
 from dbthermal.instruments.tc08 import TC08
 from dbthermal.instruments.transport import EmulatedClock
@@ -40,30 +40,13 @@ class WheelFaults:
     long_reports: bool = False  # reports of an end have the status behind, as 20 bytes
     stuck: str = ""  # states that it reports whatever it does, joined by |
     stuck_from: float = 0.0  # time from when it does [s]
-    slow: float = 1.0  # factor by which moves take longer
-    stands_after: float = math.inf  # way after which the counter stands, trying on [deg]
+    slow: float = 1.0  # factor by which moves are slower
+    stands_at: float = math.inf  # angle beyond which the counter stands, as if moving on [deg]
     stops_short: float = 0.0  # way that remains when a move is said to be over [deg]
     deaf_to: str = ""  # name of the message that it ignores, or "all"
-    weak: float = 1.0  # factor of the speeds that it takes
+    weak: float = 1.0  # factor of the speed that it takes
     notice: str = ""  # error that it reports at the next message, once
     polls: float = math.inf  # after which it is pulled out
-
-
-@dataclass(frozen=True)
-class StandingDrive(Drive):
-    """A motion that stands after a way [count], and never ends."""
-
-    way: float = 0.0
-
-    @property
-    def duration(self) -> float:
-        """Infinite."""
-        return math.inf
-
-    def place(self, time: float) -> float:
-        """Place at a time [count]."""
-        way = min(abs(super().place(time) - self.origin), self.way)
-        return self.origin + math.copysign(way, self.distance)
 
 
 class FaultyApt(EmulatedApt):
@@ -86,9 +69,8 @@ class FaultyApt(EmulatedApt):
     def turn_to(self, position: int) -> None:
         """Begin a move to a place [count] without the driver."""
         data = apt.pack(apt.Position(1, position))
-        self.receive(
-            apt.encode(apt.Message(Id.MOT_MOVE_ABSOLUTE, destination=apt.BAY_1, data=data))
-        )
+        message = apt.Message(Id.MOT_MOVE_ABSOLUTE, destination=apt.BAY_1, data=data)
+        self.receive(apt.encode(message))
 
     def obey(self, message: apt.Message) -> None:
         """Carry out a message, or ignore it by a fault."""
@@ -100,11 +82,10 @@ class FaultyApt(EmulatedApt):
             notice = struct.pack("<HH64s", message.id, 1, faults.notice.encode())
             faults.notice = ""
             self.reply(Id.HW_RICHRESPONSE, notice)
-        if message.id == Id.MOT_SET_VELPARAMS and faults.weak != 1.0:
+        if message.id == Id.MOT_SET_VELPARAMS:
             speeds = apt.parse(apt.Speeds, message)
-            weak = [round(faults.weak * v) for v in (speeds.acceleration, speeds.velocity)]
-            data = apt.pack(speeds._replace(acceleration=weak[0], velocity=weak[1]))
-            message = message._replace(data=data)
+            weak = speeds._replace(velocity=round(faults.weak * speeds.velocity))
+            message = message._replace(data=apt.pack(weak))
         super().obey(message)
 
     def poll(self) -> list[bytes]:
@@ -121,8 +102,7 @@ class FaultyApt(EmulatedApt):
 
     def next_due(self) -> float:
         """Time until something may be due [s]."""
-        times = [time - self.world.clock() for time, _ in self._waiting]
-        return max(0.0, min([super().next_due(), *times]))
+        return 0.0 if self._waiting else super().next_due()
 
     def reply(self, identifier: Id, *arguments: Any, **options: Any) -> None:
         """Send an answer or a report, or lose it, change its form or add to it by a fault."""
@@ -139,28 +119,21 @@ class FaultyApt(EmulatedApt):
             super().reply(Id.MOT_MOVE_COMPLETED)
         super().reply(identifier, *arguments, **options)
 
-    def plan(self, drive: Drive) -> Drive:
-        """Motion that is slower, shorter or endless by a fault."""
-        degree = self.model.turn / 360.0
-        faults, way = self.faults, abs(drive.distance)
-        short = 0.0 if drive.homing else min(faults.stops_short * degree, way)
-        planned = replace(
-            drive,
-            distance=math.copysign(way - short, drive.distance),
-            velocity=drive.velocity / faults.slow,
-            acceleration=drive.acceleration / faults.slow**2,
-        )
-        if faults.stands_after * degree >= way:
-            return planned
-        return StandingDrive(**vars(planned), way=faults.stands_after * degree)
+    def start(self, distance: float, velocity: float, *, homing: bool = False) -> None:
+        """Begin a motion that is slower or shorter by a fault."""
+        short = 0.0 if homing else self.faults.stops_short * self.model.turn / 360.0
+        way = math.copysign(max(0.0, abs(distance) - short), distance)
+        super().start(way, velocity / self.faults.slow, homing=homing)
 
     def status(self) -> apt.Status:
-        """State with bits that stick."""
-        status, faults = super().status(), self.faults
-        if not faults.stuck or self.clock() < faults.stuck_from:
-            return status
-        stuck = sum(StatusBits[name] for name in faults.stuck.split("|"))
-        return status._replace(bits=status.bits | stuck)
+        """State with bits that stick, and a counter that stands."""
+        (channel, position, encoder, bits), faults = super().status(), self.faults
+        if faults.stuck and self.clock() >= faults.stuck_from:
+            bits |= sum(StatusBits[name] for name in faults.stuck.split("|"))
+        if position >= faults.stands_at * self.model.turn / 360.0:
+            position = round(faults.stands_at * self.model.turn / 360.0)
+            bits |= StatusBits.MOVING_FORWARD
+        return apt.Status(channel, position, encoder, bits)
 
 
 def request(
@@ -172,11 +145,6 @@ def request(
 
 reply = partial(request, status=0)
 """Bytes of its reply."""
-
-
-def text(sequence: int, command: int) -> bytes:
-    """Bytes of debug text that a Boson sends unasked, on a channel of its own."""
-    return request(sequence, command, b"emulated debug text", 0, channel=0x99)
 
 
 FILTERS = {1: "open", 3: "9.5", 5: "LW"}

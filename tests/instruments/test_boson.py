@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 
 import pytest
 from dialogue import Dialogue, Pair
-from faulty_devices import BosonBench, reply, request, text
+from faulty_devices import BosonBench, reply, request
 from hypothesis import given
 from hypothesis import strategies as st
 from test_codecs import FRAMES
@@ -106,7 +106,7 @@ def test_every_setting_is_kept(bench: BosonBench, name: str) -> None:
 
 PIECES = [ESCAPED_REPLY[:17], ESCAPED_REPLY[17:18], ESCAPED_REPLY[18:]]
 LATE = reply(1, FPA, b"\x00\x01") + reply(2, FPA, b"\x01\x7c")
-OTHERS = text(1, SERIAL) + SERIAL_REQUEST  # on another channel, and an echo
+OTHERS = reply(1, SERIAL, b"debug text", channel=0x99) + SERIAL_REQUEST  # and an echo
 DAMAGED = SERIAL_REPLY[:-2] + b"\x11\xae"
 # Dialogues that end in a value: reading, bytes, value. Other software reads FF85 as 6541.3 °C.
 TALKS: list[tuple[Reading[Any], list[Pair], float]] = [

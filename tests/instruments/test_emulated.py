@@ -9,8 +9,8 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -155,45 +155,26 @@ def recorded(folder: Path) -> dict[str, str]:
     return {**files, "previews": str(order)}
 
 
-@contextmanager
-def load(processes: int) -> Iterator[None]:
-    """Keep the computer busy with some processes."""
-    command = [sys.executable, "-c", "while True: pass"]
-    busy = [subprocess.Popen(command) for _ in range(processes)]
-    try:
-        yield
-    finally:
-        for process in busy:
-            process.kill()
-            process.wait()
-
-
-@contextmanager
-def single_core() -> Iterator[None]:
-    """Run on one core, where the system can tell a process so."""
-    if not hasattr(os, "sched_setaffinity"):
-        pytest.skip("the system does not bind a process to a core")
-    before = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {min(before)})
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, before)
-
-
 def test_a_recording_has_the_same_bytes_under_load_and_on_one_core(tmp_path: Path) -> None:
     """Every file of a sweep and of a scene is the same, at rest, under load and on one core."""
     first = recorded(tmp_path / "rest")
     assert len(first) > 100
-    with load(2):
+    with ExitStack() as stack:
+        for _ in range(2):
+            busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+            stack.callback(stack.enter_context(busy).kill)
         assert recorded(tmp_path / "load") == first
-    with single_core():
-        assert recorded(tmp_path / "core") == first
     capture = open_capture(tmp_path / "load" / "scene.zarr")
     assert capture.attrs["started"].startswith(f"{START:%Y-%m-%dT}")
     totals = capture.attrs["totals"]
     assert {band: total["frames"] for band, total in totals.items()} == {"8-14": 120, "9.5": 121}
     assert all(total["refused"] == total["lost"] == 0 for total in totals.values())
+    if not hasattr(os, "sched_setaffinity"):
+        pytest.skip("the system does not bind a process to a core")
+    with ExitStack() as stack:
+        stack.callback(os.sched_setaffinity, 0, cores := os.sched_getaffinity(0))
+        os.sched_setaffinity(0, {min(cores)})
+        assert recorded(tmp_path / "core") == first
 
 
 def test_real_time_is_an_option() -> None:

@@ -20,33 +20,28 @@ from dbthermal.instruments.filterwheel import (
 )
 from dbthermal.instruments.transport import TransportError
 
-SIXTHS = {
-    "BSC201": [0, 68_267, 136_533, 204_800, 273_067, 341_333],
-    "SCC201": [0, 68_267, 136_533, 204_800, 273_067, 341_333],
-    "BSC101": [0, 4267, 8533, 12_800, 17_067, 21_333],
-}
-"""Places of the slots [count], rounded each by itself."""
-
-# Speeds of 1 turn/s and 1 turn/s^2 in the numbers that thorlabs_apt_device has.
-TURNS = {"BSC201": (4506, 21_987_328), "SCC201": (4506, 21_987_328), "BSC101": (25_600, 25_600)}
+RACK = [0, 68_267, 136_533, 204_800, 273_067, 341_333], (4506, 21_987_328), "0x11, 0x21"
+UNIT = [0, 4267, 8533, 12_800, 17_067, 21_333], (25_600, 25_600), "0x50, 0x50"
+MODELS = {"BSC201": RACK, "SCC201": RACK, "BSC101": UNIT}
+"""Places of the slots [count], rounded each by itself; speeds of 1 turn/s^2 and 1 turn/s in the
+numbers that thorlabs_apt_device has; addresses."""
 
 
-@pytest.mark.parametrize("model", SIXTHS)
+@pytest.mark.parametrize("model", MODELS)
 def test_every_slot_turns_into_the_beam(model: str) -> None:
     """Rack or not, and whatever it calls itself: home, then every slot is where it should be."""
-    bench = WheelBench(model)
-    wheel = bench.homed()
-    slots = (6, 1, 2, 5, 3, 4)
+    bench, (places, speeds, addresses) = WheelBench(model), MODELS[model]
+    wheel, slots = bench.homed(), (6, 1, 2, 5, 3, 4)
     for position in slots:
         wheel.move_to(position)
         assert (wheel.position(), bench.world.wheel_position) == (position, position)
     assert wheel.is_simulated
-    assert wheel.identity()["model"] == model
-    assert wheel.identity()["addresses"] == ("0x50, 0x50" if model == "BSC101" else "0x11, 0x21")
+    identity = wheel.identity()
+    assert (identity["model"], identity["addresses"]) == (model, addresses)
     moves = [struct.unpack("<Hi", data)[1] for data in bench.device.sent("MOT_MOVE_ABSOLUTE")]
-    assert moves == [SIXTHS[model][slot - 1] for slot in slots]
-    speeds = struct.unpack("<Hiii", bench.device.sent("MOT_SET_VELPARAMS")[0])
-    assert speeds == (1, 0, *TURNS[model])
+    assert moves == [places[slot - 1] for slot in slots]
+    sent = struct.unpack("<Hiii", bench.device.sent("MOT_SET_VELPARAMS")[0])
+    assert sent == (1, 0, *speeds)
     order = [message.id for message in bench.device.received]
     assert max(order.index(0x0210), order.index(0x0440)) < order.index(0x0443)  # enabled, then home
 
@@ -258,13 +253,13 @@ def test_harmless_faults(bench: WheelBench, faults: dict[str, object]) -> None:
 
 # Of a move to slot 3: fault, error, its text, if the wheel is stopped, and must then be homed.
 STALLS: list[tuple[dict[str, Any], type[WheelError], str, bool, bool]] = [
-    ({"stands_after": 20.0}, StalledWheelError, "120.00 deg: .* at 20.00 deg for 2", True, True),
+    ({"stands_at": 20.0}, StalledWheelError, "120.00 deg: .* at 20.00 deg for 2", True, True),
     # It still moves, however near to its target it is seen twice.
-    ({"stands_after": 119.95, "unreported": True}, StalledWheelError, "at 119.95 deg", True, True),
+    ({"stands_at": 119.95, "unreported": True}, StalledWheelError, "at 119.95 deg", True, True),
     ({"stops_short": 1.5}, StalledWheelError, "stopped at 118.50 deg. Must arrive", False, True),
     ({"deaf_to": "MOT_MOVE_ABSOLUTE"}, StalledWheelError, "did not start and is at 0", False, True),
     ({"stuck": "OVERLOAD"}, StalledWheelError, "OVERLOAD, and the wheel was stopped", True, True),
-    ({"slow": 30.0}, WheelError, "deg after 20.0 s, and was stopped", True, False),
+    ({"slow": 100.0}, WheelError, "deg after 20.0 s, and was stopped", True, False),
     ({"deaf_to": "all"}, NoReplyError, "must be on and in no other program's use", False, False),
     ({"notice": "motor hot"}, WheelError, "error 1 of message 0x0480: motor hot", False, False),
 ]
@@ -299,7 +294,7 @@ def test_moves_that_fail(
     ("faults", "error", "message"),
     [
         ({"deaf_to": "MOT_MOVE_HOME"}, StalledWheelError, "Search for home: .* did not start"),
-        ({"slow": 30.0}, WheelError, "Search for home: .* after 60.0 s"),
+        ({"slow": 100.0}, WheelError, "Search for home: .* after 60.0 s"),
     ],
 )
 def test_searches_for_home_that_fail(

@@ -263,14 +263,9 @@ class EmulatedApt(Line):
         acceleration = self._kept[Id.MOT_SET_VELPARAMS].acceleration / self.model.acceleration
         if self.enabled and speed >= SLOWEST and acceleration > 0:
             now = self.world.clock()
-            drive = Drive(now, self.position, distance, speed, acceleration, homing)
-            self._drive = self.plan(drive)
+            self._drive = Drive(now, self.position, distance, speed, acceleration, homing)
             self.homed &= not homing
             self._advance()
-
-    def plan(self, drive: Drive) -> Drive:
-        """Motion as it is carried out; replaced in tests."""
-        return drive
 
     def reply(self, identifier: Id, data: bytes = b"", value: int = 0, source: int = 0) -> None:
         """Send a message, of channel 1 without data; by default from the motor's address."""
