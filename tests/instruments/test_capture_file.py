@@ -193,23 +193,23 @@ def numbers(field: telemetry.Field) -> st.SearchStrategy[float]:
     return every.map(lambda number: number / field.steps + field.zero) if field.steps else every
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "offset", "expected"),
-    [
-        ("frame_counter", 1234567, 84, "12 00 87 D6"),
-        ("fpa_temperature", 311.2, 94, "28 0C"),
-        ("uptime", 20576.117, 280, "39 01 75 F7"),
-    ],
-)
-def test_vectors(name: str, value: float, offset: int, expected: str) -> None:
-    """The bytes in the buffer are those of the public decoders, both ways."""
-    wanted = bytes.fromhex(expected)
-    result = telemetry.encode({name: value}, COLUMNS).astype("<u2").tobytes()
-    assert result[offset : offset + len(wanted)] == wanted
-    buffer = bytearray(2 * telemetry.WORDS)
-    buffer[offset : offset + len(wanted)] = wanted
+# Field, value, byte and bytes of it, by the public decoders.
+VECTORS = [
+    ("frame_counter", 1234567, 84, "12 00 87 D6"),
+    ("fpa_temperature", 311.2, 94, "28 0C"),
+    ("uptime", 20576.117, 280, "39 01 75 F7"),
+]
+
+
+def test_fields_have_the_published_bytes() -> None:
+    """The bytes in the buffer are those of the public decoders, both ways, and 0 elsewhere."""
+    values, buffer = {name: value for name, value, _, _ in VECTORS}, bytearray(2 * telemetry.WORDS)
+    for _, _, offset, line in VECTORS:
+        buffer[offset : offset + len(bytes.fromhex(line))] = bytes.fromhex(line)
+    encoded = telemetry.encode(values, COLUMNS).astype("<u2").tobytes()
+    assert encoded == bytes(buffer).ljust(len(encoded), b"\0")
     decoded = telemetry.decode(np.frombuffer(bytes(buffer), dtype="<u2"))
-    assert decoded[name] == pytest.approx(value, abs=1e-9)
+    assert {name: decoded[name] for name in values} == pytest.approx(values, abs=1e-9)
 
 
 @given(st.fixed_dictionaries({name: numbers(field) for name, field in telemetry.FIELDS.items()}))
