@@ -7,9 +7,10 @@ checked against its frames (`CheckedRecording`).
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import count, pairwise
+from itertools import chain, pairwise, repeat
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -183,7 +184,6 @@ def test_a_clock_that_drifts(tmp_path: Path) -> None:
 
 TROUBLES: list[Exception] = [
     *(BosonError("refused"), BosonTimeoutError("mute"), TransportError("unplugged")),
-    TimeoutError("no answer"),
     *(filterwheel.WheelError("motor hot"), filterwheel.NoReplyError("silent")),
     *(filterwheel.NotHomedError("lost"), filterwheel.StalledWheelError("stuck")),
     *(ReadingError("open"), TC08Error("be read", 16)),
@@ -192,15 +192,17 @@ TROUBLES: list[Exception] = [
 
 def test_an_instrument_that_fails_costs_no_frame(tmp_path: Path) -> None:
     """Slow readings go on beside a failing one; whatever its driver raises is noted as failed."""
-    recorded, values = CheckedRecording(tmp_path / "a.zarr"), count(300.0)
+    recorded = CheckedRecording(tmp_path / "a.zarr")
+    air = Mock(side_effect=chain([300.0, 301.0], repeat(TimeoutError("no answer"))))
 
     def fail(error: Exception) -> float:
         recorded.world.clock.sleep(0.002)
         raise error
 
     failing: dict[str, Read] = {type(error).__name__: partial(fail, error) for error in TROUBLES}
-    recorded.record(0.8, {**failing, "plate": lambda: next(values)})
+    recorded.record(0.8, {**failing, "air": air, "plate": lambda: 300.0})
     for name in failing:
         assert {*recorded.kinds(name)} == {"reading_failed"}
-    assert recorded.noted("plate")[:2] == [("reading", 300.0), ("reading", 301.0)]
-    assert {*recorded.kinds("plate")} == {"reading"}
+    assert recorded.noted("air")[:2] == [("reading", 300.0), ("reading", 301.0)]
+    assert {*recorded.kinds("air")[2:]} == {"reading_failed"}
+    assert {*recorded.noted("plate")} == {("reading", 300.0)}
