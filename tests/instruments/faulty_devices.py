@@ -11,8 +11,6 @@ from functools import partial
 from typing import Any
 from unittest.mock import Mock
 
-import numpy as np
-
 from dbthermal.instruments import _apt as apt
 from dbthermal.instruments import boson
 from dbthermal.instruments._apt import Id
@@ -195,9 +193,10 @@ class LoggerBench:
     """A driver on an emulated unit, a clock, and tips whose temperatures a test sets."""
 
     def __init__(self) -> None:
-        self.clock = clock_at(1000.0)
-        self.tips = {1: 350.0, 2: 300.0}
-        self.unit = EmulatedTC08(lambda channel: self.tips.get(channel, np.nan), self.clock)
+        self.tips, self.clock = {"plate": 350.0, "room": 300.0}, clock_at(1000.0)
+        places = {1: "plate", 2: "room"}
+        world = World(clock=self.clock, scene=lambda _: self.tips, thermocouples=places)
+        self.unit = EmulatedTC08(world)
         self.driver = TC08(self.unit)
 
     def fail(self, code: int, *functions: str) -> None:

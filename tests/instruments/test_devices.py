@@ -130,7 +130,7 @@ def test_one_scan_gives_all_channels_once() -> None:
 
     def read(channel: int, rise: float) -> float:
         """Reading of a channel [K] where the tips are warmer than at first by a rise [K]."""
-        bench.tips = {1: 350.0 + rise, 2: 300.0 + rise}
+        bench.tips = {"plate": 350.0 + rise, "room": 300.0 + rise}
         return round(thermocouples.read(channel), 3)
 
     assert [read(1, 0.0), read(2, 1.0)] == [350.0, 300.0]

@@ -16,7 +16,7 @@ code. The conversion time is from datalogd's documentation, and likely, not cert
 import math
 import struct
 import threading
-from collections.abc import Callable, MutableSequence
+from collections.abc import MutableSequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, Final
@@ -30,7 +30,7 @@ from dbthermal.instruments.emulated import ROOM, World
 from dbthermal.instruments.filterwheel import BSC20X, StatusBits
 from dbthermal.instruments.session import WHEEL
 from dbthermal.instruments.tc08 import CHANNELS
-from dbthermal.instruments.transport import Clock, Closing, TransportError
+from dbthermal.instruments.transport import Closing, TransportError
 
 Numbers = MutableSequence[Any]  # a ctypes array of the caller, written in place
 
@@ -304,9 +304,8 @@ class EmulatedTC08:
 
     is_simulated: Final = True
 
-    def __init__(self, temperature: Callable[[int], float], clock: Clock) -> None:
-        # Of the tip of a channel, 1 to 8 [K], NaN if it is open; and where a reading takes time.
-        self._temperature, self.clock = temperature, clock
+    def __init__(self, world: World) -> None:
+        self._world, self.clock = world, world.clock
         self.is_open, self.error = False, 0
         self._kinds: dict[int, str] = {}
 
@@ -356,7 +355,7 @@ class EmulatedTC08:
             return math.nan, False
         if channel == 0:
             return ROOM, False
-        tip = self._temperature(channel)
+        tip = self._world.thermocouple_temperature(channel)
         return (tip if RANGE[0] <= tip <= RANGE[1] else math.nan), False
 
 
