@@ -19,7 +19,7 @@ from dbthermal.instruments.emulated import World
 from dbthermal.instruments.emulated.devices import EmulatedApt, EmulatedBoson, EmulatedTC08
 from dbthermal.instruments.filterwheel import BSC10X, FilterWheel, Settings, StatusBits
 from dbthermal.instruments.tc08 import TC08
-from dbthermal.instruments.transport import EmulatedClock
+from dbthermal.instruments.transport import EmulatedClock, Transport
 
 _ENDS = {Id.MOT_MOVE_COMPLETED, Id.MOT_MOVE_STOPPED, Id.MOT_MOVE_HOMED}  # of a motion
 
@@ -148,6 +148,12 @@ reply = partial(request, status=0)
 FILTERS = {1: "open", 3: "9.5", 5: "LW"}
 QUICK = Settings(velocity=50.0, home_velocity=20.0, acceleration=1e3)
 """A wheel that turns in no time."""
+
+
+def connected(line: Transport, settings: Settings | None = None) -> FilterWheel:
+    """A wheel's driver that is connected."""
+    (wheel := FilterWheel(line, FILTERS, settings)).connect()
+    return wheel
 
 
 def clock_at(time: float) -> EmulatedClock:

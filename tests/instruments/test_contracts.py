@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 from faulty_camera import frames, two_cameras
-from faulty_devices import FILTERS, QUICK, LoggerBench
+from faulty_devices import FILTERS, QUICK, BosonBench, LoggerBench, connected
 from test_v4l2 import BYTES, GOOD, STREAM, Driver
 
 from dbthermal.instruments import boson, filterwheel, inventory, v4l2
@@ -32,11 +32,11 @@ from dbthermal.instruments.camera import (
 )
 from dbthermal.instruments.devices import open_devices
 from dbthermal.instruments.emulated import World
-from dbthermal.instruments.emulated.devices import EmulatedApt, EmulatedBoson
-from dbthermal.instruments.filterwheel import FilterWheel, Settings
+from dbthermal.instruments.emulated.devices import EmulatedApt
+from dbthermal.instruments.filterwheel import FilterWheel
 from dbthermal.instruments.session import Session
 from dbthermal.instruments.tc08 import TC08
-from dbthermal.instruments.transport import Transport, TransportError, open_serial
+from dbthermal.instruments.transport import TransportError, open_serial
 
 
 def address(name: str) -> str:
@@ -54,17 +54,9 @@ class Opened(NamedTuple):
     again: Callable[[], object] | None = None
 
 
-def connected(line: Transport, settings: Settings | None = None) -> FilterWheel:
-    """A wheel's driver that is connected."""
-    wheel = FilterWheel(line, FILTERS, settings)
-    wheel.connect()
-    return wheel
-
-
 def emulated_camera(_: ExitStack) -> Opened:
     """A Boson's driver on the emulator."""
-    (world := World()).add_camera("wide", 93588)
-    return Opened(Boson(EmulatedBoson(world, "wide")), True)
+    return Opened(BosonBench().camera, True)
 
 
 def real_camera(_: ExitStack) -> Opened:

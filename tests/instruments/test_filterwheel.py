@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from dialogue import Dialogue, Pair
-from faulty_devices import FILTERS, WheelBench, WheelFaults
+from faulty_devices import FILTERS, WheelBench, WheelFaults, connected
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -133,12 +133,6 @@ def status(position: int, bits: int) -> bytes:
     """Bytes of a status."""
     data = struct.pack("<HiiI", 1, position, 0, bits)
     return bytes.fromhex("81 04 0e 00 81 21") + data
-
-
-def connected(dialogue: Dialogue) -> FilterWheel:
-    """A wheel at the end of a dialogue, once it is connected."""
-    (wheel := FilterWheel(dialogue, FILTERS)).connect()
-    return wheel
 
 
 def test_dialogue_of_a_move() -> None:

@@ -48,10 +48,11 @@ def swept(
     preview: Callable[[Preview], None] | None = None,
 ) -> list[Summary]:
     """Sweep a blackbody that is at once where it is set."""
+    temperatures = [] if log is None else log
 
     def set_temperature(value: float) -> None:
         devices.world.blackbody_temperature = value
-        (log if log is not None else []).append(value)
+        temperatures.append(value)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(protocols, "STABILITY_PERIOD", 0.01)
