@@ -26,7 +26,7 @@ if TYPE_CHECKING:  # matplotlib is loaded with the first picture: a `Watch` does
     from dbthermal.figures import Panel
     from dbthermal.separation import Stream
 
-__all__ = ["Picture", "Separation", "Status", "View", "Watch"]
+__all__ = ["Separation", "Status", "View", "Watch"]
 __dir__ = __all__.copy
 
 _WINDOW: Final = 3.0  # time over which a frame rate is measured [s]
@@ -165,20 +165,6 @@ def _ffc(band: str, preview: Preview) -> str:
     return "unknown" if reading is None else _ffc_state(reading)
 
 
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """Picture for a notebook (PNG) with the same in words for a terminal."""
-
-    png: bytes
-    text: str
-
-    def __repr__(self) -> str:
-        return self.text
-
-    def _repr_png_(self) -> bytes:
-        return self.png
-
-
 class Separation:
     """Live separation of the pairs of frames that a view is shown, for its `separation`.
 
@@ -209,8 +195,9 @@ class View:
     """Live view: an instance is the `preview` of a recording, or of several.
 
     It is shown on a `display`, such as IPython's ``DisplayHandle``, first by its ``display``, then
-    by its ``update``; without one the last `figure` is only kept. An update, once a second at most,
-    of two bands of 640 x 512 takes a fifth of a second of one core.
+    by its ``update``, as a PNG and in words for a terminal; without one the last `figure` is only
+    kept. An update, once a second at most, of two bands of 640 x 512 takes a fifth of a second of
+    one core.
 
     Examples
     --------
@@ -271,8 +258,9 @@ class View:
             ]
             png, fast = io.BytesIO(), {"compress_level": _COMPRESSION}  # rather than small
             self.figure.savefig(png, format="png", pil_kwargs=fast)
-            picture = Picture(png.getvalue(), "\n".join((title, *lines, foot)))
-            (self._display.update if self._is_shown else self._display.display)(picture)
+            words = "\n".join((title, *lines, foot))
+            formats = {"image/png": png.getvalue(), "text/plain": words}
+            (self._display.update if self._is_shown else self._display.display)(formats, raw=True)
             self._is_shown = True
 
 

@@ -195,12 +195,13 @@ def test_updates_keep_the_period() -> None:
     assert shown == [0.0, 1.0, 2.1, 0.3]
     view(replace(preview(0.1), frames={}))
     view(preview(0.2))
-    assert "2 lost" in repr(display.update.call_args[0][0])
+    assert "2 lost" in display.update.call_args[0][0]["text/plain"]
     assert display.update.call_count == 4
-    picture = display.display.call_args[0][0]
-    assert picture._repr_png_().startswith(b"\x89PNG\r\n")
-    assert repr(picture).startswith("pot (emulated), 0.0 s\n9.5: - frames/s, 2 lost")
-    assert repr(picture).endswith(f"plate 30.0 {DEGREE}")
+    assert display.update.call_args.kwargs == {"raw": True}
+    formats = display.display.call_args[0][0]
+    assert formats["image/png"].startswith(b"\x89PNG\r\n")
+    assert formats["text/plain"].startswith("pot (emulated), 0.0 s\n9.5: - frames/s, 2 lost")
+    assert formats["text/plain"].endswith(f"plate 30.0 {DEGREE}")
 
 
 def test_labels_and_room() -> None:
