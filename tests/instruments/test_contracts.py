@@ -21,15 +21,8 @@ from faulty_devices import FILTERS, QUICK, BosonBench, LoggerBench, connected
 from test_v4l2 import BYTES, GOOD, STREAM, Driver
 
 from dbthermal.instruments import boson, filterwheel, inventory, v4l2
+from dbthermal.instruments import camera as interface
 from dbthermal.instruments.boson import BAUDRATE, Boson
-from dbthermal.instruments.camera import (
-    FfcStatus,
-    FrameSource,
-    NoFrameError,
-    SourceLostError,
-    Stream,
-    camera_kind,
-)
 from dbthermal.instruments.devices import open_devices
 from dbthermal.instruments.emulated import World
 from dbthermal.instruments.emulated.devices import EmulatedApt
@@ -112,10 +105,10 @@ def y16_video(stack: ExitStack) -> Opened:
 def real_video(stack: ExitStack) -> Opened:
     """Frames of a camera, opened by its kind in the format that the environment says."""
     url = address("DBTHERMAL_VIDEO")
-    kind = camera_kind(os.environ.get("DBTHERMAL_VIDEO_KIND", "boson"))
+    kind = interface.camera_kind(os.environ.get("DBTHERMAL_VIDEO_KIND", "boson"))
     rows, columns = os.environ.get("DBTHERMAL_VIDEO_SHAPE", "512x640").split("x")
     rate = float(os.environ.get("DBTHERMAL_VIDEO_RATE", "60"))
-    stream = Stream((int(rows), int(columns)), rate)
+    stream = interface.Stream((int(rows), int(columns)), rate)
     return Opened(stack.enter_context(kind.open_frames(url, stream)), False)
 
 
@@ -127,7 +120,7 @@ LOGGERS: list[Opening] = [emulated_logger, real_logger]
 VIDEOS: list[Opening] = [stub_video, emulated_video, y16_video, real_video]
 
 
-CLOSED = (TransportError, RuntimeError, SourceLostError)
+CLOSED = (TransportError, RuntimeError, interface.SourceLostError)
 NAMES = {"model", "part_number", "serial_number"}
 
 
@@ -212,7 +205,7 @@ def test_a_camera_corrects_its_offsets(opened: Opened) -> None:
     before = camera.read(boson.LAST_FFC_FRAME)
     camera._clock.sleep(0.05)
     assert camera.run_ffc() > before
-    assert camera.ffc_status() is FfcStatus.COMPLETE
+    assert camera.ffc_status() is interface.FfcStatus.COMPLETE
 
 
 @opens(*CAMERAS)
@@ -258,14 +251,14 @@ def test_a_logger_reads_a_room(opened: Opened) -> None:
 @opens(*VIDEOS)
 def test_frames_follow_one_another(opened: Opened) -> None:
     """Frames have the source's shape, numbers that rise by one, times that rise."""
-    source: FrameSource = opened.device
+    source: interface.FrameSource = opened.device
     results = list(frames(source, 10))
     assert {frame.counts.shape for frame in results} == {source.shape}
     assert {frame.counts.dtype for frame in results} == {np.dtype(np.uint16)}
     assert np.all(np.diff([frame.sequence for frame in results]) == 1)
     assert np.all(np.diff([frame.device_time for frame in results]) > 0)
     assert {frame.telemetry is None for frame in results} == {source.telemetry_rows == 0}
-    with pytest.raises(NoFrameError, match="No frame from"):  # silence is no loss
+    with pytest.raises(interface.NoFrameError, match="No frame from"):  # silence is no loss
         source.read(0.0)
 
 

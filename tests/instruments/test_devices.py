@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from faulty_devices import BosonBench, LoggerBench
-from rig_session import TEXT, bench, from_yaml, pictures, replaced, rig
+from rig_session import bench, from_yaml, pictures, replaced, rig
 
 from dbthermal.instruments import boson
 from dbthermal.instruments.boson import Boson, FfcMode, Ir16Mode, Switch
@@ -19,7 +19,7 @@ from dbthermal.instruments.transport import TransportError
 @pytest.fixture
 def devices() -> Iterator[Devices]:
     """Open the whole rig on emulators."""
-    with rig(from_yaml(TEXT)) as opened:
+    with rig(from_yaml()) as opened:
         yield opened
 
 
@@ -41,7 +41,7 @@ def test_every_device_says_what_it_is(devices: Devices) -> None:
 
 def test_whole_rig_is_closed() -> None:
     """All devices of the file are closed in the end."""
-    with rig(from_yaml(TEXT)) as devices:
+    with rig(from_yaml()) as devices:
         assert devices.wheel is not None
         assert devices.thermocouples is not None
     for ask in (devices.wheel.status, *(port.fpa_temperature for port in devices.cameras.values())):
@@ -95,7 +95,7 @@ def test_setting_that_is_not_taken_is_an_error() -> None:
     bench.device.settings = Kept({**bench.device.settings, boson.IR16_MODE.command: 2})
     message = r"Invalid IR16 mode .*TLINEAR.* of camera 93588, set to .*COUNTS_16.* Must be"
     with pytest.raises(ValueError, match=message):
-        Devices(from_yaml(TEXT), {}, {"9.5": bench.camera}).prepare()
+        Devices(from_yaml(), {}, {"9.5": bench.camera}).prepare()
 
 
 def test_camera_is_called_by_the_filter_in_the_beam(devices: Devices) -> None:

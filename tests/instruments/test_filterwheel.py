@@ -7,12 +7,11 @@ from typing import Any
 
 import pytest
 from dialogue import Dialogue, Pair
-from faulty_devices import FILTERS, WheelBench, WheelFaults, connected
+from faulty_devices import WheelBench, WheelFaults, connected
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dbthermal.instruments.filterwheel import (
-    FilterWheel,
     NoReplyError,
     NotHomedError,
     StalledWheelError,
@@ -73,8 +72,7 @@ def test_filters_are_called_by_their_band(bench: WheelBench) -> None:
     with pytest.raises(WheelError, match="No filter in slot 2"):
         wheel.band()
     wheel.move_to(5)
-    later = FilterWheel(bench.device, FILTERS)
-    later.connect()  # a new program need not home the wheel again
+    later = connected(bench.device)  # a new program need not home the wheel again
     assert later.band() == "LW"
 
 

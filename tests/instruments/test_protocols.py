@@ -9,18 +9,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from faulty_camera import Faults, FaultyCamera
-from rig_session import (
-    LEVELS,
-    QUICK,
-    SHAPE,
-    TEXT,
-    bench,
-    from_yaml,
-    pictures,
-    replaced,
-    rig,
-    scene_text,
-)
+from rig_session import LEVELS, QUICK, SHAPE, bench, from_yaml, pictures, replaced, rig, scene_text
 
 from dbthermal import store
 from dbthermal.instruments import protocols, recording
@@ -185,7 +174,7 @@ def test_a_step_must_be_of_one_state(tmp_path: Path) -> None:
 def test_blackbody_must_be_read(tmp_path: Path) -> None:
     """A sweep without a reading of the blackbody raises an error before it begins."""
     with (
-        rig(from_yaml(TEXT)) as devices,
+        rig(from_yaml()) as devices,
         pytest.raises(ValueError, match="Must have and read a blackbody"),
     ):
         swept(replace(devices, thermocouples=None), tmp_path)
@@ -227,7 +216,7 @@ def test_scene_begins_with_its_recording(tmp_path: Path) -> None:
 def wait_for_rest(read: Callable[[float], float]) -> tuple[float, float]:
     """Mean that is found where 300 K are waited for, by a reading of the time, and the time."""
     clock = EmulatedClock()
-    result = protocols.wait_stable(from_yaml(TEXT), 300.0, lambda: read(clock()), clock=clock)
+    result = protocols.wait_stable(from_yaml(), 300.0, lambda: read(clock()), clock=clock)
     return result, clock()
 
 

@@ -142,7 +142,7 @@ def test_interrupted(
 
 def test_blackbody_is_set_by_the_user(monkeypatch: pytest.MonkeyPatch) -> None:
     """The user gets degrees Celsius; without a keyboard, the error says where to run it."""
-    questions, devices = list[str](), Devices(from_yaml(TEXT), {})
+    questions, devices = list[str](), Devices(from_yaml(), {})
     monkeypatch.setattr("builtins.input", questions.append)
     command._set_blackbody(devices, 300.0)
     text = "\nplate: set the blackbody to 26.85 degC and press Enter; then its rest is awaited. "
@@ -162,7 +162,7 @@ def test_bus_need_not_be_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
         raise inventory.LibusbMissingError("no libusb")
 
     monkeypatch.setattr(inventory, "find", missing)
-    emulated = from_yaml(TEXT)
+    emulated = from_yaml()
     real = replace(emulated, simulated=False)
     assert inventory.plugged_in(real) == "The USB bus was not looked at: no libusb"
     assert "is emulated: the USB bus was not" in inventory.plugged_in(emulated)

@@ -24,7 +24,7 @@ REAL = ("simulated: true", "simulated: false")
 
 def test_session_is_read() -> None:
     """All keys of the file are read; devices have their addresses, emulated or not."""
-    session = from_yaml(TEXT)
+    session = from_yaml()
     assert session.bands == ("8-14", "9.5")
     assert session.cameras["9.5"].video == "v4l2:///dev/video2"
     assert session.filters == {1: "9.5", 3: "11"}
@@ -124,7 +124,7 @@ def test_shared_rig_is_in_a_file_of_its_own(tmp_path: Path) -> None:
     path, rig = tmp_path / "a.yaml", tmp_path / "rig.yaml"
     path.write_text("\n".join(lines), encoding="utf-8")
     rig.write_text("\n".join(shared), encoding="utf-8")
-    assert Session.load(path) == from_yaml(TEXT)
+    assert Session.load(path) == from_yaml()
     wrong = [line.replace("telemetry_rows: 2", "telemetry_rows: 1") for line in shared]
     for lines, message in (
         (wrong, r"rig\.yaml: Invalid telemetry_rows 1\. Must be 0 or 2"),
