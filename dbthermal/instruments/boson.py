@@ -49,7 +49,7 @@ _START, _END, _ESCAPE = b"\x8e", b"\xae", b"\x9e"
 _SPECIAL = _START + _END + _ESCAPE
 _SHIFT = 0x0D  # an escaped byte is sent as the escape byte and the value less this
 _ESCAPED = re.compile(rb"\x9e[\x81\x91\xa1]")
-_RAISED = bytes.maketrans(_SPECIAL, bytes(value + 1 for value in _SPECIAL))
+_RAISED = bytes.maketrans(_SPECIAL, bytes(v + 1 for v in _SPECIAL))  # next that need no escape
 _HEADER = struct.Struct(">BIII")
 _CHECKSUM = struct.Struct(">H")
 
