@@ -28,7 +28,7 @@ from typing import Any, Final, Generic, TypeVar
 from scipy.constants import zero_Celsius
 
 from dbthermal.instruments import telemetry, v4l2
-from dbthermal.instruments.camera import CameraKind, FfcMode, FfcStatus, GainMode, Identity
+from dbthermal.instruments.camera import CameraKind, FfcStatus, Identity
 from dbthermal.instruments.transport import Closing, Transport
 
 __all__ = ["KIND", "Boson", "BosonError", "BosonTimeoutError"]
@@ -49,33 +49,27 @@ _START, _END, _ESCAPE = b"\x8e", b"\xae", b"\x9e"
 _SPECIAL = _START + _END + _ESCAPE
 _SHIFT = 0x0D  # an escaped byte is sent as the escape byte and the value less this
 _ESCAPED = re.compile(rb"\x9e[\x81\x91\xa1]")
+_RAISED = bytes.maketrans(_SPECIAL, bytes(v + 1 for v in _SPECIAL))  # next that need no escape
 _HEADER = struct.Struct(">BIII")
 _CHECKSUM = struct.Struct(">H")
 
 T = TypeVar("T")
 EnumT = TypeVar("EnumT", bound=IntEnum)
 
+Switch = IntEnum("Switch", "OFF ON", start=0)
+"""State of a function."""
 
-class Switch(IntEnum):
-    """State of a function."""
+FfcMode = IntEnum("FfcMode", "MANUAL AUTO EXTERNAL SHUTTER_TEST", start=0)
+"""Trigger of a flat-field correction; if it is external the shutter stays open before the scene."""
 
-    OFF = 0
-    ON = 1
+GainMode = IntEnum("GainMode", "HIGH LOW AUTO DUAL MANUAL", start=0)
+"""Sensitivity; low gain has the larger range of temperatures."""
 
+Ir16Mode = IntEnum("Ir16Mode", "COUNTS_16 COUNTS_14 TLINEAR", start=0)
+"""Content of the 16-bit USB video: counts, counts of 14 bits, or scaled temperature."""
 
-class Ir16Mode(IntEnum):
-    """Content of the 16-bit USB video: counts, counts of 14 bits, or scaled temperature."""
-
-    COUNTS_16 = 0
-    COUNTS_14 = 1
-    TLINEAR = 2
-
-
-class TelemetryLocation(IntEnum):
-    """Place of the telemetry rows: before the image or after it."""
-
-    TOP = 0
-    BOTTOM = 1
+TelemetryLocation = IntEnum("TelemetryLocation", "TOP BOTTOM", start=0)
+"""Place of the telemetry rows: before the image or after it."""
 
 
 @dataclass(frozen=True)
@@ -84,44 +78,38 @@ class Reading(Generic[T]):
 
     name: str  # for messages
     command: int  # identifier
-    layout: str  # data of the reply, as in `struct`, big-endian
     convert: Callable[..., T]  # value of the unpacked data; ValueError if they have no meaning
+    layout: str = ">I"  # data of the reply, as in `struct`, big-endian
 
 
 @dataclass(frozen=True)
-class Setting(Generic[EnumT]):
-    """A mode that is set by one command, as a 32-bit number, and read by the next identifier."""
+class Setting(Reading[EnumT]):
+    """A mode that is read as a 32-bit number, and set by the identifier before."""
 
-    name: str
-    set_command: int
-    kind: type[EnumT]
-
-    @property
-    def reading(self) -> Reading[EnumT]:
-        """Command that reads the mode back."""
-        return Reading(self.name, self.set_command + 1, ">i", self.kind)
+    convert: type[EnumT]
+    layout: str = ">i"
 
 
-SERIAL_NUMBER: Final = Reading("serial number", 0x00050002, ">I", int)
+SERIAL_NUMBER: Final = Reading("serial number", 0x00050002, int)
 PART_NUMBER: Final = Reading(
-    "part number", 0x00050004, ">20s", lambda raw: raw.split(b"\0", 1)[0].decode("ascii")
+    "part number", 0x00050004, lambda raw: raw.split(b"\0", 1)[0].decode("ascii"), ">20s"
 )
-SENSOR_SERIAL_NUMBER: Final = Reading("sensor serial number", 0x00050006, ">I", int)
+SENSOR_SERIAL_NUMBER: Final = Reading("sensor serial number", 0x00050006, int)
 SOFTWARE_REVISION: Final = Reading(
-    "software revision", 0x00050022, ">III", lambda *numbers: ".".join(map(str, numbers))
+    "software revision", 0x00050022, lambda *numbers: ".".join(map(str, numbers)), ">III"
 )
 FPA_TEMPERATURE: Final = Reading(
-    "FPA temperature [K]", 0x00050030, ">h", lambda tenths: float(tenths / 10.0 + zero_Celsius)
+    "FPA temperature [K]", 0x00050030, lambda tenths: float(tenths / 10.0 + zero_Celsius), ">h"
 )
-FFC_IN_PROGRESS: Final = Reading("FFC in progress", 0x0005000C, ">h", Switch)
-FFC_STATUS: Final = Reading("FFC status", 0x00050054, ">i", FfcStatus)
-LAST_FFC_FRAME: Final = Reading("frame of the last FFC", 0x0005005D, ">I", int)
+FFC_IN_PROGRESS: Final = Reading("FFC in progress", 0x0005000C, Switch, ">h")
+FFC_STATUS: Final = Reading("FFC status", 0x00050054, FfcStatus, ">i")
+LAST_FFC_FRAME: Final = Reading("frame of the last FFC", 0x0005005D, int)
 
-FFC_MODE: Final = Setting("FFC mode", 0x00050012, FfcMode)
-GAIN_MODE: Final = Setting("gain mode", 0x00050014, GainMode)
-IR16_MODE: Final = Setting("IR16 mode", 0x000E000D, Ir16Mode)
-TELEMETRY: Final = Setting("telemetry", 0x00040001, Switch)
-TELEMETRY_LOCATION: Final = Setting("telemetry location", 0x00040003, TelemetryLocation)
+FFC_MODE: Final = Setting("FFC mode", 0x00050013, FfcMode)
+GAIN_MODE: Final = Setting("gain mode", 0x00050015, GainMode)
+IR16_MODE: Final = Setting("IR16 mode", 0x000E000E, Ir16Mode)
+TELEMETRY: Final = Setting("telemetry", 0x00040002, Switch)
+TELEMETRY_LOCATION: Final = Setting("telemetry location", 0x00040004, TelemetryLocation)
 
 _MODES = FFC_MODE, GAIN_MODE, IR16_MODE, TELEMETRY, TELEMETRY_LOCATION
 SETTINGS: Final[tuple[Setting[Any], ...]] = _MODES
@@ -187,11 +175,7 @@ def encode(frame: Packet) -> bytes:
 def next_sequence(sequence: int) -> int:
     """Next larger sequence number without a byte that would be escaped; 0 after the largest."""
     following = ((sequence + 1) % (1 << 32)).to_bytes(4, "big")
-    for position, value in enumerate(following):
-        if value in _SPECIAL:  # the least number above: the bytes behind start from zero
-            raised = following[:position] + bytes([value + 1]) + bytes(3 - position)
-            return int.from_bytes(raised, "big")
-    return int.from_bytes(following, "big")
+    return int.from_bytes(following.translate(_RAISED), "big")
 
 
 class Decoder:
@@ -287,16 +271,13 @@ class Boson(Closing):
         except ValueError as error:
             raise BosonError(f"Invalid reply to '{name}': {error}") from error
 
-    def get(self, setting: Setting[EnumT]) -> EnumT:
-        """State of a setting."""
-        return self.read(setting.reading)
-
     def set(self, setting: Setting[EnumT], value: EnumT) -> None:
         """Set one of `SETTINGS` until power-off; a wrong value is a ValueError."""
-        if value not in {*setting.kind}:
-            choices = ", ".join(f"{member.value} ({member.name})" for member in setting.kind)
+        if value not in {*setting.convert}:
+            choices = ", ".join(f"{member.value} ({member.name})" for member in setting.convert)
             raise ValueError(f"Invalid {setting.name} {value}. Must be one of {choices}.")
-        self._command(f"set {setting.name}", setting.set_command, struct.pack(">i", value))
+        data = struct.pack(setting.layout, value)
+        self._command(f"set {setting.name}", setting.command - 1, data)
 
     def serial_number(self) -> int:
         """Serial number of the camera."""
@@ -309,8 +290,8 @@ class Boson(Closing):
             "sensor_serial_number": str(self.read(SENSOR_SERIAL_NUMBER)),
             "part_number": self.read(PART_NUMBER),
             "software_revision": self.read(SOFTWARE_REVISION),
-            "gain_mode": self.get(GAIN_MODE).name.lower(),
-            "ffc_mode": self.get(FFC_MODE).name.lower(),
+            "gain_mode": self.read(GAIN_MODE).name.lower(),
+            "ffc_mode": self.read(FFC_MODE).name.lower(),
             "is_simulated": self.is_simulated,
         }
 
@@ -332,8 +313,7 @@ class Boson(Closing):
         }
         for setting, value in settings.items():
             self.set(setting, value)
-            state = self.get(setting)
-            if state != value:
+            if (state := self.read(setting)) != value:
                 label = f"Invalid {setting.name} {state!r} of camera {self.serial_number()}"
                 raise ValueError(f"{label}, set to {value!r}. Must be as it was set.")
 
@@ -369,8 +349,7 @@ class Boson(Closing):
         for _ in range(repeats + 1):
             with self._clock.hold(self._lock):
                 self._sequence = next_sequence(self._sequence)
-                number, status = self._sequence, REQUEST
-                request = Packet(COMMAND_CHANNEL, number, command, status, data)
+                request = Packet(COMMAND_CHANNEL, self._sequence, command, REQUEST, data)
                 self._transport.write(encode(request))
                 if reply := self._reply(name):
                     break

@@ -66,32 +66,8 @@ UNTIMED: Final = DAMAGED | _WRONG_TIME | FrameFlag.PADDED
 image keeps its time, for a closed aperture looks the same."""
 
 
-class FfcStatus(IntEnum):
-    """State of a camera's flat-field correction (FFC)."""
-
-    NONE_PERFORMED = 0
-    IMMINENT = 1
-    IN_PROGRESS = 2
-    COMPLETE = 3
-
-
-class FfcMode(IntEnum):
-    """Trigger of a flat-field correction; in `EXTERNAL` the shutter stays open before the scene."""
-
-    MANUAL = 0
-    AUTO = 1
-    EXTERNAL = 2
-    SHUTTER_TEST = 3
-
-
-class GainMode(IntEnum):
-    """Sensitivity; low gain has the larger range of temperatures."""
-
-    HIGH = 0
-    LOW = 1
-    AUTO = 2
-    DUAL = 3
-    MANUAL = 4
+FfcStatus = IntEnum("FfcStatus", "NONE_PERFORMED IMMINENT IN_PROGRESS COMPLETE", start=0)
+"""State of a camera's flat-field correction (FFC)."""
 
 
 class NoFrameError(TimeoutError):

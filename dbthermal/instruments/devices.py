@@ -191,8 +191,7 @@ def open_devices(
             if world is None:
                 logger = TC08.from_url(session.devices[LOGGER])
             else:
-                tips = world.thermocouple_temperature, world.clock
-                logger = TC08(_emulated(".devices").EmulatedTC08(*tips)).open()
+                logger = TC08(_emulated(".devices").EmulatedTC08(world)).open()
             stack.enter_context(logger).set_channels(session.thermocouples)
         yield Devices(session, sources, controls, wheel, logger, world)
 

@@ -125,7 +125,7 @@ class Scale:
 # 200 full steps of 2048 microsteps, and of 128.
 BSC20X: Final = Scale(turn=409_600, velocity=53.68, acceleration=53.68 * 204.94e-6)
 BSC10X: Final = Scale(turn=25_600, velocity=1.0, acceleration=1.0)
-# Beginnings of the model names that are accepted; some BSC201 call themselves SCC201.
+# First five letters of the model names that are accepted; some BSC201 call themselves SCC201.
 MODELS: Final = {"BSC20": BSC20X, "SCC20": BSC20X, "BSC10": BSC10X, "BSC00": BSC10X}
 
 
@@ -161,12 +161,10 @@ class FilterWheel(Closing):
         model = apt.text(info.model)
         if expected is not None and info.serial_number != expected:
             raise WheelError(f"Wrong controller {info.serial_number}. Must be {expected}.")
-        # Its scale, by the beginning of its name.
-        scales = [scale for beginning, scale in MODELS.items() if model.startswith(beginning)]
-        if not scales:
+        if (beginning := model[:5]) not in MODELS:
             rule = f"Its model must begin with one of {sorted(MODELS)}"
             raise WheelError(f"Wrong device '{model}', number {info.serial_number}. {rule}.")
-        self._scale = scales[0]
+        self._scale = MODELS[beginning]
         self._identity = {
             "model": model,
             "serial_number": str(info.serial_number),
@@ -195,8 +193,8 @@ class FilterWheel(Closing):
         self._controller.begin(Id.MOT_MOVE_HOME, CHANNEL)
         # The counter may stand while a controller searches for the switch: no stall limit. The
         # homed bit alone may be that of an earlier search: the wheel must have moved.
-        limits, mask = (HOME_TIMEOUT, HOME_TIMEOUT), StatusBits.HOMED | StatusBits.HOMING
-        action = "Search for home", Id.MOT_MOVE_HOMED, limits
+        action = "Search for home", Id.MOT_MOVE_HOMED, (HOME_TIMEOUT, HOME_TIMEOUT)
+        mask = StatusBits.HOMED | StatusBits.HOMING
         self._follow(*action, lambda status: status.bits & mask == StatusBits.HOMED)
         self._is_lost = False
 
@@ -207,18 +205,17 @@ class FilterWheel(Closing):
         StalledWheelError, after which it must be homed, if the wheel does not move, stops elsewhere
         or has a fault; WheelError if it takes too long, and was stopped.
         """
-        scale = self._scale
-        target = scale.target(position, self.settings.home_offset)
+        target = (scale := self._scale).target(position, self.settings.home_offset)
         self._resting(homed=True)
         # The move, until the wheel is there.
-        data = apt.pack(apt.Position(CHANNEL, target))
-        self._controller.begin(Id.MOT_MOVE_ABSOLUTE, data=data)
+        self._controller.begin(Id.MOT_MOVE_ABSOLUTE, data=apt.pack(apt.Position(CHANNEL, target)))
         name, limits = f"Move to {scale.degrees(target):.2f} deg", (MOVE_TIMEOUT, STALL_TIMEOUT)
-        action = name, Id.MOT_MOVE_COMPLETED, limits
+
+        def arrived(status: apt.Status) -> bool:
+            return abs(scale.degrees(status.position - target)) <= TOLERANCE
+
         try:
-            self._follow(
-                *action, lambda status: abs(scale.degrees(status.position - target)) <= TOLERANCE
-            )
+            self._follow(name, Id.MOT_MOVE_COMPLETED, limits, arrived)
         except StalledWheelError:
             self._is_lost = True
             raise

@@ -26,7 +26,7 @@ if TYPE_CHECKING:  # matplotlib is loaded with the first picture: a `Watch` does
     from dbthermal.figures import Panel
     from dbthermal.separation import Stream
 
-__all__ = ["Picture", "Separation", "Status", "View", "Watch"]
+__all__ = ["Separation", "Status", "View", "Watch"]
 __dir__ = __all__.copy
 
 _WINDOW: Final = 3.0  # time over which a frame rate is measured [s]
@@ -88,13 +88,12 @@ class Watch:
     """Numbers of a recording, from its previews."""
 
     def __init__(self) -> None:
-        self._last: Preview | None = None
-        self._past: deque[tuple[float, dict[str, tuple[int, float]]]] = deque()
+        self._past: deque[Preview] = deque()  # of the last window, some 20 MB
         self._ffc_times: dict[str, float] = {}
 
     def note(self, preview: Preview) -> bool:
         """Take the next preview; return True if it is the first preview of a recording."""
-        before, self._last = self._last, preview
+        before = self._past[-1] if self._past else None
         # Of another recording: other bands, or a time or a number of frames that falls.
         if before is None or not (
             tuple(before.totals) == tuple(preview.totals)
@@ -109,21 +108,17 @@ class Watch:
             frames = {_metadata(band, shown).last_ffc_frame for shown in (before, preview)}
             if _ffc(band, preview) == _IN_PROGRESS or (None not in frames and len(frames) > 1):
                 self._ffc_times[band] = preview.time
-        # Numbers of frames and times of arrival, for the frame rate.
-        marks = {
-            band: (preview.totals[band]["frames"], frame.host_time)
-            for band, frame in preview.frames.items()
-        }
-        self._past.append((preview.time, marks))
-        while len(self._past) > 1 and self._past[1][0] <= preview.time - _WINDOW:
+        self._past.append(preview)
+        while len(self._past) > 1 and self._past[1].time <= preview.time - _WINDOW:
             self._past.popleft()
         return before is None
 
     def status(self) -> dict[str, Status]:
         """Band to its `Status` at the last preview; empty before the first one."""
         statuses: dict[str, Status] = {}
-        if (last := self._last) is None:
+        if not self._past:
             return statuses
+        last = self._past[-1]
         for band, totals in last.totals.items():
             values: dict[str, Any] = {**totals, "ffc": _ffc(band, last)}
             # The temperature by its reading, else by the telemetry.
@@ -144,13 +139,14 @@ class Watch:
 
     def _rate(self, band: str) -> float:
         """Rate by the times at which the frames came: they are written in bursts."""
-        marks = [marks[band] for _, marks in self._past if band in marks]
-        if not marks:
+        past = [preview for preview in self._past if band in preview.frames]
+        if not past:
             return math.nan
-        (before, start), (now, stop) = marks[0], marks[-1]
-        if stop > start:
-            return (now - before) / (stop - start)
-        is_old = self._past[-1][0] - self._past[0][0] >= _WINDOW
+        first, last = past[0], past[-1]
+        seconds = last.frames[band].host_time - first.frames[band].host_time
+        if seconds > 0:
+            return (last.totals[band]["frames"] - first.totals[band]["frames"]) / seconds
+        is_old = self._past[-1].time - self._past[0].time >= _WINDOW
         return 0.0 if is_old else math.nan
 
 
@@ -167,20 +163,6 @@ def _ffc(band: str, preview: Preview) -> str:
         return _IN_PROGRESS
     reading = preview.readings.get(FFC_READING + band)
     return "unknown" if reading is None else _ffc_state(reading)
-
-
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """Picture for a notebook (PNG) with the same in words for a terminal."""
-
-    png: bytes
-    text: str
-
-    def __repr__(self) -> str:
-        return self.text
-
-    def _repr_png_(self) -> bytes:
-        return self.png
 
 
 class Separation:
@@ -213,8 +195,9 @@ class View:
     """Live view: an instance is the `preview` of a recording, or of several.
 
     It is shown on a `display`, such as IPython's ``DisplayHandle``, first by its ``display``, then
-    by its ``update``; without one the last `figure` is only kept. An update, once a second at most,
-    of two bands of 640 x 512 takes a fifth of a second of one core.
+    by its ``update``, as a PNG and in words for a terminal; without one the last `figure` is only
+    kept. An update, once a second at most, of two bands of 640 x 512 takes a fifth of a second of
+    one core.
 
     Examples
     --------
@@ -275,8 +258,9 @@ class View:
             ]
             png, fast = io.BytesIO(), {"compress_level": _COMPRESSION}  # rather than small
             self.figure.savefig(png, format="png", pil_kwargs=fast)
-            picture = Picture(png.getvalue(), "\n".join((title, *lines, foot)))
-            (self._display.update if self._is_shown else self._display.display)(picture)
+            words = "\n".join((title, *lines, foot))
+            formats = {"image/png": png.getvalue(), "text/plain": words}
+            (self._display.update if self._is_shown else self._display.display)(formats, raw=True)
             self._is_shown = True
 
 

@@ -76,9 +76,7 @@ Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=
 Label = Annotated[str, Field(min_length=1, max_length=64), AfterValidator(_printable)]
 Slot = Annotated[int, Field(strict=True, ge=1, le=6)]
 Channel = Annotated[int, Field(strict=True, ge=1, le=8)]
-DeviceName = Literal["filter_wheel", "thermocouples"]
 Video = Annotated[str, _address("v4l2")]
-Port = Annotated[str, _address("serial")]
 
 
 @dataclass(frozen=True, config=_CHECKED)
@@ -93,7 +91,7 @@ class Camera:
     """
 
     video: Video
-    control: Port | None = None
+    control: Annotated[str, _address("serial")] | None = None
     kind: str = "boson"
 
     def __post_init__(self) -> None:
@@ -170,7 +168,7 @@ class Session:
     frame_rate: Annotated[Positive, Field(le=1e4)] = 60.0
     shape: tuple[Pixels, Pixels] = (512, 640)
     telemetry_rows: Literal[0, 2] = 0
-    devices: dict[DeviceName, str] = field(default_factory=dict)
+    devices: dict[Literal["filter_wheel", "thermocouples"], str] = field(default_factory=dict)
     filters: dict[Slot, Name] = field(default_factory=dict)
     wheel: Settings = field(default_factory=Settings)
     sweep: tuple[Name, ...] = ()

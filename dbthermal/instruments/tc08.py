@@ -123,8 +123,7 @@ class TC08(Closing):
     >>> from dbthermal.instruments.emulated import World, devices
     >>> bench = World(blackbody_temperature=310.0)
     >>> bench.thermocouples[1] = "blackbody"
-    >>> unit = devices.EmulatedTC08(bench.thermocouple_temperature, bench.clock)
-    >>> with TC08(unit).open() as logger:
+    >>> with TC08(devices.EmulatedTC08(bench)).open() as logger:
     ...     logger.set_channels({1: "blackbody"})
     ...     print(f"{logger.read(1):.2f} K")
     310.00 K

@@ -148,7 +148,7 @@ class EmulatedClock(Clock):
         self._now = 0.0
         self._lock = threading.Lock()
         self._waits: list[_Wait] = []
-        self._members, self._running = set[int](), set[int]()  # of the order; that do not wait
+        self._members = set[int]()  # threads of the order, of which those run that do not wait
 
     def __call__(self) -> float:
         """Time since the start [s]."""
@@ -200,9 +200,7 @@ class EmulatedClock(Clock):
         with self._lock:
             is_member = turn.thread in self._members
             self._members.add(turn.thread)
-            if entered is None:
-                self._running.add(turn.thread)
-            else:
+            if entered is not None:
                 self._waits.append(turn)
         if entered is not None:
             entered.set()
@@ -213,7 +211,6 @@ class EmulatedClock(Clock):
             if not is_member:  # the next thread runs
                 with self._lock:
                     self._members.discard(turn.thread)
-                    self._running.discard(turn.thread)
                     self._next()
 
     def _wait(self, condition: Callable[[], bool], timeout: float = math.inf) -> bool:
@@ -222,13 +219,11 @@ class EmulatedClock(Clock):
         try:
             with self._lock:
                 self._waits.append(turn)
-                self._running.discard(turn.thread)
                 self._next()
             self._await(turn)
         except BaseException:  # an interrupt: this thread goes on
             with self._lock:
                 self._waits = [wait for wait in self._waits if wait is not turn]
-                self._run(turn)
             raise
         return turn.held
 
@@ -239,7 +234,7 @@ class EmulatedClock(Clock):
 
     def _next(self) -> None:
         """Let the next thread run, if none does."""
-        while self._waits and not self._running:
+        while self._waits and self._members <= {wait.thread for wait in self._waits}:
             for chosen in self._waits:
                 chosen.held = chosen.condition()
                 if chosen.held or chosen.end <= self._now:
@@ -249,13 +244,8 @@ class EmulatedClock(Clock):
                 if math.isinf(chosen.end):
                     return  # a thread outside the order has what all wait for
                 self._now = chosen.end
-            self._run(chosen)
             self._waits.remove(chosen)
-
-    def _run(self, wait: _Wait) -> None:
-        if wait.thread in self._members:
-            self._running.add(wait.thread)
-        wait.over.set()
+            chosen.over.set()
 
 
 def parse(url: str, scheme: str) -> str:

@@ -78,9 +78,7 @@ class Kernel:
     ioctl: Callable[[int, int, bytearray], int] = field(
         default_factory=lambda: importlib.import_module("fcntl").ioctl  # not on Windows
     )
-    map: Callable[[int, int, int], Any] = field(
-        default=lambda file, length, offset: mmap.mmap(file, length, offset=offset)
-    )
+    map: Callable[..., Any] = mmap.mmap
     select: Callable[..., tuple[Sequence[Any], Sequence[Any], Sequence[Any]]] = select.select
     clock: Clock = SYSTEM
 
@@ -111,7 +109,7 @@ class Capture(Closing):
             (count, *_) = self._ask(REQBUFS, REQUEST, BUFFERS, _CAPTURE, _MMAP)
             for index in range(count):
                 offset, length = self._ask(QUERYBUF, BUFFER, *_buffer(index))[9:]
-                self._maps.append(self._kernel.map(self._file, length, offset))
+                self._maps.append(self._kernel.map(self._file, length, offset=offset))
                 self._ask(QBUF, BUFFER, *_buffer(index))
             self._ask(STREAMON, _TYPE, _CAPTURE)
         except BaseException:

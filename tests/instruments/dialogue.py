@@ -12,8 +12,7 @@ Pair = tuple[bytes | None, bytes | Sequence[bytes] | None]
 
 
 class Dialogue(Closing):
-    """
-    A transport that expects certain bytes, gives certain answers, and fails on leftovers.
+    """A transport that expects certain bytes, gives certain answers, and fails on leftovers.
 
     Used as a context manager it checks at its end that all was written and all was read. An answer
     in several pieces takes one read for each; a read for which nothing is left times out.
@@ -23,22 +22,19 @@ class Dialogue(Closing):
 
     def __init__(self, pairs: Iterable[Pair]) -> None:
         self.clock: Clock = EmulatedClock()
-        self._pairs = list(pairs)
-        self._written = b""
+        self._pairs, self._written = list(pairs), b""
         self._answers: list[bytes] = []
-        self._next()
+        self._answer()
 
     def write(self, data: bytes) -> None:
         """Compare what a driver sends with what it should."""
         assert not self._answers, f"Unread {self._answers!r}, but {data.hex(' ')} was written."
-        assert self._pairs, f"Unexpected {data.hex(' ')} was written. Must be nothing more."
-        expected = self._pairs[0][0] or b""
+        expected = (self._pairs[0][0] if self._pairs else None) or b""
         self._written += data
         assert expected.startswith(self._written), (
             f"Unexpected {self._written.hex(' ')} was written. Must be {expected.hex(' ')}."
         )
-        if self._written == expected:
-            self._answer()
+        self._answer()
 
     def read(self, size: int, timeout: float) -> bytes:  # noqa: ARG002 - no time goes by
         """Give the next piece of the answer, at most `size` bytes; empty if all is read."""
@@ -47,8 +43,7 @@ class Dialogue(Closing):
         piece = self._answers.pop(0)
         if piece[size:]:
             self._answers.insert(0, piece[size:])
-        elif not self._answers:
-            self._next()
+        self._answer()
         return piece[:size]
 
     def close(self) -> None:
@@ -61,14 +56,8 @@ class Dialogue(Closing):
             assert not any(leftover), f"Left unread, cut short and unwritten: {leftover!r}."
 
     def _answer(self) -> None:
-        """Make the answer of the first pair ready to be read."""
-        _, answer = self._pairs.pop(0)
-        pieces = [answer] if isinstance(answer, bytes) else list(answer or ())
-        self._written, self._answers = b"", pieces
-        if not pieces:
-            self._next()
-
-    def _next(self) -> None:
-        """Let the device send without a request where the dialogue says so."""
-        if self._pairs and self._pairs[0][0] is None:
-            self._answer()
+        """Make answers ready to be read once all is written that the device waits for."""
+        while self._pairs and not self._answers and self._written == (self._pairs[0][0] or b""):
+            _, answer = self._pairs.pop(0)
+            self._answers = [answer] if isinstance(answer, bytes) else list(answer or ())
+            self._written = b""

@@ -5,16 +5,8 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 
-from dbthermal.instruments.camera import (
-    FRAME_TIMEOUT,
-    Counts,
-    Frame,
-    FrameFlag,
-    FrameSource,
-    NoFrameError,
-)
+from dbthermal.instruments.camera import GOOD, Counts, Frame, FrameFlag, FrameSource
 from dbthermal.instruments.emulated import EmulatedCamera, Picture, World
 from dbthermal.instruments.session import Camera, Session
 
@@ -34,27 +26,14 @@ class Faults:
     offset_step: float = 0.0  # RMS change of a pixel's offset by a correction [count]
     clock_rate: float = 1.0  # camera's seconds per second; other than 1 it is a clock of its own
     unplugged: int | None = None  # frame at which it is pulled out
-    mute: bool = False  # gives no frame at all
-    seed: int = 0  # of the random numbers
 
 
 @dataclass
 class FaultyCamera(EmulatedCamera):
-    """An emulated camera with faults."""
+    """An emulated camera with faults; see `Faults`."""
 
     faults: Faults = field(default_factory=Faults)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._repeats = False
-        self._offsets: tuple[int, npt.NDArray[np.int32]] = 0, np.zeros(self.shape, np.int32)
-
-    def read(self, timeout: float = FRAME_TIMEOUT) -> Frame:
-        """Give the next frame, unless the camera is mute."""
-        if self.faults.mute:
-            self.clock.sleep(timeout)
-            raise NoFrameError(f"No frame from emulated camera '{self.name}': it is mute.")
-        return super().read(timeout)
+    _repeats: bool = field(default=False, init=False)
 
     def next_number(self, number: int, elapsed: float) -> int:
         """Skip the frames that are dropped, and unplug the camera when its fault says so."""
@@ -72,15 +51,17 @@ class FaultyCamera(EmulatedCamera):
             with self.world.lock:
                 self.world.camera(self.name).frame_count = number
                 self.world.start_ffc(self.name)
-        frame = super().frame(number, due)
-        counts, flags = self._damaged(number, frame.counts)
-        own_clock = self.faults.clock_rate != 1
+        frame, half, flags = super().frame(number, due), self.shape[0] // 2, GOOD
+        if number in self.faults.corrupt:
+            noise = np.random.default_rng(number).integers(0, LIMITS.max, self.shape, endpoint=True)
+            frame.counts[half:], flags = noise[half:], FrameFlag.DRIVER_ERROR
+        elif number in self.faults.short:
+            frame.counts[half:], flags = 0, FrameFlag.WRONG_SIZE
         return replace(
             frame,
-            counts=counts,
             # Both clocks have the host's origin, so that rates alone differ.
             device_time=self.faults.clock_rate * frame.device_time,
-            flags=flags | (FrameFlag.FOREIGN_CLOCK if own_clock else FrameFlag(0)),
+            flags=flags | (FrameFlag.FOREIGN_CLOCK if self.faults.clock_rate != 1 else GOOD),
             metadata=None if flags else frame.metadata,
         )
 
@@ -91,23 +72,9 @@ class FaultyCamera(EmulatedCamera):
         image, count = super().image(time), self.world.camera(self.name).ffc_count
         if count == 0 or self.faults.offset_step == 0:
             return image
-        if self._offsets[0] != count:
-            rng = np.random.default_rng([self.faults.seed, count])
-            step = rng.normal(0.0, self.faults.offset_step, self.shape)
-            self._offsets = count, np.rint(step).astype(np.int32)
-        counts: Counts = np.clip(image + self._offsets[1], 0, LIMITS.max).astype(np.uint16)
+        step = np.random.default_rng(count).normal(0.0, self.faults.offset_step, self.shape)
+        counts: Counts = np.clip(image + np.rint(step), 0, LIMITS.max).astype(np.uint16)
         return counts
-
-    def _damaged(self, number: int, counts: Counts) -> tuple[Counts, FrameFlag]:
-        faults, half = self.faults, self.shape[0] // 2
-        if number in faults.corrupt:
-            rng = np.random.default_rng([faults.seed, number])
-            counts[half:] = rng.integers(0, LIMITS.max, counts[half:].shape, endpoint=True)
-            return counts, FrameFlag.DRIVER_ERROR
-        if number in faults.short:
-            counts[half:] = 0
-            return counts, FrameFlag.WRONG_SIZE
-        return counts, FrameFlag(0)
 
 
 def frames(source: FrameSource, number: int) -> Iterator[Frame]:
@@ -124,14 +91,13 @@ def two_cameras(
     *,
     faults: Mapping[str, Faults] | None = None,
     world: World | None = None,
-    kind: type[FaultyCamera] = FaultyCamera,
 ) -> dict[str, FaultyCamera]:
     """Two emulated cameras on one bench that see one picture, with the faults of each band."""
     world, sources = world or World(), {}
     for number, band in enumerate(BANDS):
         world.add_camera(band, 100 + number)
-        form, faults_by_band = (band, {band: picture}, band, shape, rate, rows), faults or {}
-        sources[band] = kind(world, *form, faults=faults_by_band.get(band, Faults()))
+        form, fault = (band, {band: picture}, band, shape, rate, rows), (faults or {}).get(band)
+        sources[band] = FaultyCamera(world, *form, faults=fault or Faults())
     return sources
 
 

@@ -1,34 +1,25 @@
 """Emulated wheel, camera and logger with faults, and their drivers on a simulated clock.
 
-The tests speak to the emulated devices in bytes that `request`, `reply` and `text` make, and name
-the messages and states of a wheel as its maker does, such as ``MOT_MOVE_HOME`` and ``OVERLOAD``.
+The tests speak to the emulated devices in bytes that `request` and `reply` make, and name the
+messages and states of a wheel as its maker does, such as ``MOT_MOVE_HOME`` and ``OVERLOAD``.
 """
 
 import math
 import struct
-from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
-
-import numpy as np
+from unittest.mock import Mock
 
 from dbthermal.instruments import _apt as apt
 from dbthermal.instruments import boson
 from dbthermal.instruments._apt import Id
 from dbthermal.instruments.boson import Boson
 from dbthermal.instruments.emulated import World
-from dbthermal.instruments.emulated.devices import (
-    Drive,
-    EmulatedApt,
-    EmulatedBoson,
-    EmulatedTC08,
-    Numbers,
-)
+from dbthermal.instruments.emulated.devices import EmulatedApt, EmulatedBoson, EmulatedTC08
 from dbthermal.instruments.filterwheel import BSC10X, FilterWheel, Settings, StatusBits
 from dbthermal.instruments.tc08 import TC08
-from dbthermal.instruments.transport import EmulatedClock
+from dbthermal.instruments.transport import EmulatedClock, Transport
 
 _ENDS = {Id.MOT_MOVE_COMPLETED, Id.MOT_MOVE_STOPPED, Id.MOT_MOVE_HOMED}  # of a motion
 
@@ -37,7 +28,6 @@ _ENDS = {Id.MOT_MOVE_COMPLETED, Id.MOT_MOVE_STOPPED, Id.MOT_MOVE_HOMED}  # of a 
 class WheelFaults:
     """Faults of the wheel and its line; may be changed at any time."""
 
-    silent: bool = False  # answers nothing
     drop: int = 0  # next answers that never come
     late: float = 0.0  # delay of every answer [s]
     single_bytes: bool = False  # every byte in a piece of its own
@@ -46,31 +36,15 @@ class WheelFaults:
     stray_completed: bool = False  # a report of the end of some move before every answer
     unreported: bool = False  # the end of a move is not reported
     long_reports: bool = False  # reports of an end have the status behind, as 20 bytes
-    stuck: str = ""  # states that it always reports, joined by |
-    slow: float = 1.0  # factor by which moves take longer
-    stands_after: float = math.inf  # way after which the counter stands, trying on [deg]
+    stuck: str = ""  # states that it reports whatever it does, joined by |
+    stuck_from: float = 0.0  # time from when it does [s]
+    slow: float = 1.0  # factor by which moves are slower
+    stands_at: float = math.inf  # angle beyond which the counter stands, as if moving on [deg]
     stops_short: float = 0.0  # way that remains when a move is said to be over [deg]
-    deaf_to: str = ""  # name of the message that it ignores
-    weak: float = 1.0  # factor of the speeds that it takes
+    deaf_to: str = ""  # name of the message that it ignores, or "all"
+    weak: float = 1.0  # factor of the speed that it takes
     notice: str = ""  # error that it reports at the next message, once
     polls: float = math.inf  # after which it is pulled out
-
-
-@dataclass(frozen=True)
-class StandingDrive(Drive):
-    """A motion that never ends."""
-
-    way: float = 0.0
-
-    @property
-    def duration(self) -> float:
-        """Infinite: the motion never ends."""
-        return math.inf
-
-    def place(self, time: float) -> float:
-        """Position at rest: the wheel does not move."""
-        way = min(self._rise(time - self.start), self.way)
-        return self.origin + math.copysign(way, self.distance)
 
 
 class FaultyApt(EmulatedApt):
@@ -93,25 +67,23 @@ class FaultyApt(EmulatedApt):
     def turn_to(self, position: int) -> None:
         """Begin a move to a place [count] without the driver."""
         data = apt.pack(apt.Position(1, position))
-        self.receive(
-            apt.encode(apt.Message(Id.MOT_MOVE_ABSOLUTE, destination=apt.BAY_1, data=data))
-        )
+        message = apt.Message(Id.MOT_MOVE_ABSOLUTE, destination=apt.BAY_1, data=data)
+        self.receive(apt.encode(message))
 
     def obey(self, message: apt.Message) -> None:
         """Carry out a message, or ignore it by a fault."""
         self.received.append(message)
         faults = self.faults
-        if faults.silent or (faults.deaf_to and message.id == Id[faults.deaf_to]):
+        if faults.deaf_to in {"all", Id(message.id).name}:
             return
         if faults.notice:
             notice = struct.pack("<HH64s", message.id, 1, faults.notice.encode())
             faults.notice = ""
             self.reply(Id.HW_RICHRESPONSE, notice)
-        if message.id == Id.MOT_SET_VELPARAMS and faults.weak != 1.0:
+        if message.id == Id.MOT_SET_VELPARAMS:
             speeds = apt.parse(apt.Speeds, message)
-            weak = [round(faults.weak * v) for v in (speeds.acceleration, speeds.velocity)]
-            data = apt.pack(speeds._replace(acceleration=weak[0], velocity=weak[1]))
-            message = message._replace(data=data)
+            weak = speeds._replace(velocity=round(faults.weak * speeds.velocity))
+            message = message._replace(data=apt.pack(weak))
         super().obey(message)
 
     def poll(self) -> list[bytes]:
@@ -128,8 +100,7 @@ class FaultyApt(EmulatedApt):
 
     def next_due(self) -> float:
         """Time until something may be due [s]."""
-        times = [time - self.world.clock() for time, _ in self._waiting]
-        return max(0.0, min([super().next_due(), *times]))
+        return 0.0 if self._waiting else super().next_due()
 
     def reply(self, identifier: Id, *arguments: Any, **options: Any) -> None:
         """Send an answer or a report, or lose it, change its form or add to it by a fault."""
@@ -146,27 +117,21 @@ class FaultyApt(EmulatedApt):
             super().reply(Id.MOT_MOVE_COMPLETED)
         super().reply(identifier, *arguments, **options)
 
-    def plan(self, drive: Drive) -> Drive:
-        """Motion that is slower, shorter or endless by a fault."""
-        degree = self.model.turn / 360.0
-        faults, way = self.faults, abs(drive.distance)
-        short = 0.0 if drive.homing else min(faults.stops_short * degree, way)
-        planned = replace(
-            drive,
-            distance=math.copysign(way - short, drive.distance),
-            velocity=drive.velocity / faults.slow,
-            acceleration=drive.acceleration / faults.slow**2,
-        )
-        if faults.stands_after * degree >= way:
-            return planned
-        values = {entry.name: getattr(planned, entry.name) for entry in fields(Drive)}
-        return StandingDrive(**values, way=faults.stands_after * degree)
+    def start(self, distance: float, velocity: float, *, homing: bool = False) -> None:
+        """Begin a motion that is slower or shorter by a fault."""
+        short = 0.0 if homing else self.faults.stops_short * self.model.turn / 360.0
+        way = math.copysign(max(0.0, abs(distance) - short), distance)
+        super().start(way, velocity / self.faults.slow, homing=homing)
 
     def status(self) -> apt.Status:
-        """State with bits that stick."""
-        status = super().status()
-        stuck = [StatusBits[name] for name in self.faults.stuck.split("|") if name]
-        return status._replace(bits=status.bits | sum(stuck))
+        """State with bits that stick, and a counter that stands."""
+        (channel, position, encoder, bits), faults = super().status(), self.faults
+        if faults.stuck and self.clock() >= faults.stuck_from:
+            bits |= sum(StatusBits[name] for name in faults.stuck.split("|"))
+        if position >= faults.stands_at * self.model.turn / 360.0:
+            position = round(faults.stands_at * self.model.turn / 360.0)
+            bits |= StatusBits.MOVING_FORWARD
+        return apt.Status(channel, position, encoder, bits)
 
 
 def request(
@@ -180,124 +145,31 @@ reply = partial(request, status=0)
 """Bytes of its reply."""
 
 
-def text(sequence: int, command: int) -> bytes:
-    """Bytes of debug text that a Boson sends unasked, on a channel of its own."""
-    return request(sequence, command, b"emulated debug text", 0, channel=0x99)
-
-
-class FaultyBoson(EmulatedBoson):
-    """The emulated camera that falls silent after some answers, or while its shutter is closed."""
-
-    def __init__(self, world: World, name: str) -> None:
-        super().__init__(world, name)
-        self.answers, self.stalls = math.inf, False
-        self._inbox: deque[boson.Packet] = deque()
-
-    def request(self, frame: boson.Packet) -> None:
-        """Take in one request, to be answered when the shutter is open."""
-        self.answers -= 1
-        if self.answers >= 0:
-            self._inbox.append(frame)
-
-    def poll(self) -> list[bytes]:
-        """Give the replies that are due."""
-        replies = []
-        while self._inbox and self.next_due() <= 0:
-            replies.append(self.reply(self._inbox.popleft()))
-        return replies
-
-    def next_due(self) -> float:
-        """Time until a reply is due [s]; infinite without a request."""
-        if not self._inbox:
-            return math.inf
-        return self.camera.ffc_until - self.clock() if self.stalls else 0.0
-
-
-@dataclass
-class LoggerFaults:
-    """Faults of the logger and its library; may be changed at any time."""
-
-    open: set[int] = field(default_factory=set)  # channels whose thermocouple is open: NaN
-    overflow: set[int] = field(default_factory=set)  # channels whose converter overflows
-    errors: dict[str, int] = field(default_factory=dict)  # next error number of a function
-    firmware_delay: float = 0.0  # how long opening takes [s]
-    no_unit: bool = False  # nothing is plugged in
-    unplugged: bool = False  # pulled out: every function fails with error 16
-
-
-class FaultyTC08(EmulatedTC08):
-    """The emulated library with faults."""
-
-    def __init__(self, tip: Callable[[int], float], clock: Any) -> None:
-        super().__init__(tip, clock)
-        self.faults = LoggerFaults()
-        self._opening = 0.0
-
-    def __getattribute__(self, name: str) -> Any:
-        """Give a function of the library, or one that fails."""
-        if name.startswith("usb_tc08_") and name != "usb_tc08_get_last_error":
-            code = 16 if self.faults.unplugged else self.faults.errors.pop(name, 0)
-            if code:
-                self.error = code
-                return lambda *_: -1 if name.endswith("progress") else 0
-        return super().__getattribute__(name)
-
-    def usb_tc08_open_unit_async(self) -> int:
-        """Begin the firmware's download."""
-        self._opening = self.clock()
-        return super().usb_tc08_open_unit_async()
-
-    def usb_tc08_open_unit_progress(self, handle: Numbers, percent: Numbers) -> int:
-        """Wait for the firmware."""
-        if self.clock() - self._opening < self.faults.firmware_delay:
-            return 0
-        self.is_open |= self.faults.no_unit
-        return super().usb_tc08_open_unit_progress(handle, percent)
-
-    def convert(self, channel: int) -> tuple[float, bool]:
-        """Open thermocouples, and overflows with a full scale that the header leaves open [K]."""
-        if channel in self.faults.overflow:
-            return 673.15, True
-        if channel in self.faults.open:
-            return float("nan"), False
-        return super().convert(channel)
-
-
 FILTERS = {1: "open", 3: "9.5", 5: "LW"}
 QUICK = Settings(velocity=50.0, home_velocity=20.0, acceleration=1e3)
 """A wheel that turns in no time."""
 
 
-class Clock(EmulatedClock):
-    """Emulated time from a start [s], with things to do at some times [s]."""
+def connected(line: Transport, settings: Settings | None = None) -> FilterWheel:
+    """A wheel's driver that is connected."""
+    (wheel := FilterWheel(line, FILTERS, settings)).connect()
+    return wheel
 
-    def __init__(self, now: float = 100.0) -> None:
-        super().__init__()
-        super().sleep(now)
-        self.events: list[tuple[float, Callable[[], None]]] = []
 
-    @property
-    def now(self) -> float:
-        """The time [s]."""
-        return self()
-
-    def sleep(self, seconds: float) -> None:
-        """Let time pass [s], and do what is due."""
-        super().sleep(seconds)
-        due = [event for event in self.events if event[0] <= self()]
-        for event in due:
-            self.events.remove(event)
-            event[1]()
+def clock_at(time: float) -> EmulatedClock:
+    """Emulated clock that is at a time [s]."""
+    (clock := EmulatedClock()).sleep(time)
+    return clock
 
 
 class BosonBench:
     """An emulated camera and its driver, on one clock."""
 
     def __init__(self, serial_number: int = 93588) -> None:
-        self.clock = Clock()
+        self.clock = clock_at(100.0)
         self.world = World(clock=self.clock)
         self.state = self.world.add_camera("boson", serial_number)
-        self.device = FaultyBoson(self.world, "boson")
+        self.device = EmulatedBoson(self.world, "boson")
         self.camera = Boson(self.device, first_sequence=1)
 
     def exchange(self, request: bytes) -> bytes:
@@ -310,8 +182,8 @@ class WheelBench:
     """An emulated wheel and its driver, on one simulated clock."""
 
     def __init__(self, model: str = "BSC201", slot_offset: float = 0.0, **options: object) -> None:
-        self.clock = Clock(0.0)
-        self.world = World(clock=self.clock, filters=FILTERS, wheel_position=4)
+        self.world = World(filters=FILTERS, wheel_position=4)
+        self.clock = self.world.clock
         self.device = FaultyApt(self.world, model=model, slot_offset=slot_offset)
         chosen = Settings(**options)  # type: ignore[arg-type]
         self.wheel = FilterWheel(self.device, FILTERS, chosen)
@@ -327,10 +199,18 @@ class LoggerBench:
     """A driver on an emulated unit, a clock, and tips whose temperatures a test sets."""
 
     def __init__(self) -> None:
-        self.clock = Clock(1000.0)
-        self.tips = {1: 350.0, 2: 300.0}
-        self.unit = FaultyTC08(lambda channel: self.tips.get(channel, np.nan), self.clock)
+        self.tips, self.clock = {"plate": 350.0, "room": 300.0}, clock_at(1000.0)
+        places = {1: "plate", 2: "room"}
+        world = World(clock=self.clock, scene=lambda _: self.tips, thermocouples=places)
+        self.unit = EmulatedTC08(world)
         self.driver = TC08(self.unit)
+
+    def fail(self, code: int, *functions: str) -> None:
+        """Let functions of the library fail with an error number from now on."""
+        self.unit.error = code
+        for name in functions:
+            failing = Mock(return_value=-1 if name.endswith("progress") else 0)
+            setattr(self.unit, f"usb_tc08_{name}", failing)
 
     def ready(self) -> TC08:
         """Open the unit with two thermocouples of type T."""

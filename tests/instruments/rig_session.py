@@ -50,7 +50,7 @@ blackbody: {temperatures: [300.0, 290.0, 310.0], stability: 0.1, window: 3, time
 """
 
 
-def from_yaml(text: str) -> Session:
+def from_yaml(text: str = TEXT) -> Session:
     """Session that is loaded from a text."""
     with TemporaryDirectory() as folder:
         (file := Path(folder) / "session.yaml").write_text(text, encoding="utf-8")

@@ -1,34 +1,28 @@
 """The Boson's driver: byte for byte, with faults of camera and line, and for several threads."""
 
 import struct
-import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from typing import Any
+from operator import methodcaller
+from typing import Any, NoReturn
 
 import pytest
 from dialogue import Dialogue, Pair
-from faulty_devices import BosonBench, reply, request, text
+from faulty_devices import BosonBench, reply, request
 from hypothesis import given
 from hypothesis import strategies as st
 from test_codecs import FRAMES
 
 from dbthermal.instruments import boson
-from dbthermal.instruments.boson import (
-    REPLY_TIMEOUT,
-    Boson,
-    BosonError,
-    BosonTimeoutError,
-    Reading,
-    Setting,
-)
-from dbthermal.instruments.camera import FfcStatus, GainMode
+from dbthermal.instruments.boson import Boson, BosonError, BosonTimeoutError, Reading
+from dbthermal.instruments.camera import FfcStatus
 from dbthermal.instruments.emulated import FFC_DURATION, World
 from dbthermal.instruments.emulated.devices import EmulatedBoson
 from dbthermal.instruments.transport import SYSTEM, TransportError
 
 # Identifiers and layouts of openmv/openmv, drivers/boson (commit cbbb877): to read; to set, and
-# the values from 0; the states of a correction; the error numbers.
+# the values from 0; the error numbers.
 READINGS = {
     "SERIAL_NUMBER": (0x00050002, ">I"),
     "PART_NUMBER": (0x00050004, ">20s"),
@@ -40,19 +34,20 @@ READINGS = {
     "LAST_FFC_FRAME": (0x0005005D, ">I"),
 }
 SETTINGS = {
-    "FFC_MODE": (0x00050012, ["MANUAL", "AUTO", "EXTERNAL", "SHUTTER_TEST"]),
-    "GAIN_MODE": (0x00050014, ["HIGH", "LOW", "AUTO", "DUAL", "MANUAL"]),
-    "TELEMETRY": (0x00040001, ["OFF", "ON"]),
-    "TELEMETRY_LOCATION": (0x00040003, ["TOP", "BOTTOM"]),
-    "IR16_MODE": (0x000E000D, ["COUNTS_16", "COUNTS_14", "TLINEAR"]),
+    "FFC_MODE": (0x00050012, "MANUAL AUTO EXTERNAL SHUTTER_TEST"),
+    "GAIN_MODE": (0x00050014, "HIGH LOW AUTO DUAL MANUAL"),
+    "TELEMETRY": (0x00040001, "OFF ON"),
+    "TELEMETRY_LOCATION": (0x00040003, "TOP BOTTOM"),
+    "IR16_MODE": (0x000E000D, "COUNTS_16 COUNTS_14 TLINEAR"),
 }
-STATES = ["NONE_PERFORMED", "IMMINENT", "IN_PROGRESS", "COMPLETE"]
+STATES = "NONE_PERFORMED IMMINENT IN_PROGRESS COMPLETE"
 STATUSES = [
     *(0x161, 0x162, 0x17D, 0x17E, 0x17F, 0x180, 0x181, 0x1B0, 0x201, 0x202, 0x203, 0x204),
     *(0x205, 0x206, 0x207, 0x208, 0x20B, 0x26D, 0x26E, 0x26F, 0x281, 0x283),
     *range(0x6A4, 0x6AE),
 ]
 SERIAL, PART, FPA, SET_GAIN, STATUS = 0x50002, 0x50004, 0x50030, 0x50014, 0x50054
+FOUND = {name: entry for name, entry in vars(boson).items() if isinstance(entry, Reading)}
 # Public frames: serial number 93588, and 43.1 °C with an escaped checksum.
 SERIAL_REQUEST, SERIAL_REPLY, ESCAPED_REPLY, *_ = map(bytes.fromhex, FRAMES)
 
@@ -70,45 +65,48 @@ def camera_of(line: Dialogue, first_sequence: int = 1) -> Boson:
 
 def test_commands_are_the_published_ones() -> None:
     """Readings, settings, states and errors have their published numbers, none of them twice."""
-    entries = vars(boson).items()
-    readings = {name: value for name, value in entries if isinstance(value, Reading)}
-    assert {name: (entry.command, entry.layout) for name, entry in readings.items()} == READINGS
-    settings = {name: value for name, value in entries if isinstance(value, Setting)}
-    for name, setting in settings.items():
-        kind: Any = setting.kind
-        members = [*kind]
-        assert (setting.set_command, [member.name for member in members]) == SETTINGS[name]
-        assert [member.value for member in members] == [*range(len(members))]
-        assert (setting.reading.command, setting.reading.layout) == (setting.set_command + 1, ">i")
-    assert {*boson.SETTINGS} == {*settings.values()}
-    assert settings.keys() == SETTINGS.keys()
+    modes = {name: (command + 1, ">i") for name, (command, _) in SETTINGS.items()}
+    assert {name: (entry.command, entry.layout) for name, entry in FOUND.items()} == {
+        **READINGS,
+        **modes,
+    }
+    assert {*boson.SETTINGS} == {FOUND[name] for name in SETTINGS}
+    assert {state.name: state.value for state in FfcStatus} == numbered(STATES)
     assert boson.RUN_FFC == 0x00050007
-    assert [(state.name, state.value) for state in FfcStatus] == [
-        *zip(STATES, range(4), strict=True)
-    ]
     assert [*boson.STATUSES] == STATUSES
     assert len({*boson.STATUSES.values()}) == len(STATUSES) - 9  # ten are of the flash memory
 
 
-@pytest.mark.parametrize("setting", boson.SETTINGS, ids=lambda setting: setting.name)
-def test_every_setting_is_kept(bench: BosonBench, setting: Setting[Any]) -> None:
-    """Every value is read back as set, and so is each reading; another is refused unsent."""
-    for value in setting.kind:
+def numbered(names: str) -> dict[str, int]:
+    """Names with their numbers from 0."""
+    return {name: number for number, name in enumerate(names.split())}
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_every_setting_is_kept(bench: BosonBench, name: str) -> None:
+    """Every value is sent, and read back as set, and so is each reading; another is refused."""
+    (command, members), setting = SETTINGS[name], FOUND[name]
+    assert isinstance(setting, boson.Setting)
+    kind: Any = setting.convert
+    assert {value.name: value.value for value in kind} == numbered(members)
+    for value in kind:
         bench.camera.set(setting, value)
-        assert bench.camera.get(setting) == value
+        assert bench.camera.read(setting) is value
+        with Dialogue([(request(1, command, struct.pack(">i", value)), reply(1, command))]) as line:
+            camera_of(line).set(setting, value)
     bench.state.serial_number = 0x8E9EAE81  # its bytes need escapes
-    readings = [entry for entry in vars(boson).values() if isinstance(entry, Reading)]
-    values = {reading.name: bench.camera.read(reading) for reading in readings}
+    values = {reading.name: bench.camera.read(reading) for reading in FOUND.values()}
     assert (values["serial number"], values["part number"]) == (0x8E9EAE81, "EMULATED-BOSON-640")
     assert values["FFC status"] is FfcStatus.NONE_PERFORMED
-    choices = f"0 .{setting.kind(0).name}., 1 .{setting.kind(1).name}."
+    choices = f"0 .{kind(0).name}., 1 .{kind(1).name}."
+    wrong: Any = -1
     with pytest.raises(ValueError, match=rf"Invalid {setting.name} -1\. Must be one of {choices}"):
-        camera_of(Dialogue([])).set(setting, -1)
+        camera_of(Dialogue([])).set(setting, wrong)
 
 
 PIECES = [ESCAPED_REPLY[:17], ESCAPED_REPLY[17:18], ESCAPED_REPLY[18:]]
 LATE = reply(1, FPA, b"\x00\x01") + reply(2, FPA, b"\x01\x7c")
-OTHERS = text(1, SERIAL) + SERIAL_REQUEST  # on another channel, and an echo
+OTHERS = reply(1, SERIAL, b"debug text", channel=0x99) + SERIAL_REQUEST  # and an echo
 DAMAGED = SERIAL_REPLY[:-2] + b"\x11\xae"
 # Dialogues that end in a value: reading, bytes, value. Other software reads FF85 as 6541.3 °C.
 TALKS: list[tuple[Reading[Any], list[Pair], float]] = [
@@ -135,12 +133,16 @@ def test_dialogues_that_give_a_value(
         assert camera_of(line, first).read(reading) == pytest.approx(value, abs=1e-9)
 
 
+# What asks for the exchange of a command.
+ASKED = {entry.command: methodcaller("read", entry) for entry in FOUND.values()}
+ASKED[SET_GAIN] = methodcaller("set", boson.GAIN_MODE, boson.GainMode.LOW)
+LOW_GAIN, ONE_BYTE = request(1, SET_GAIN, b"\x00\x00\x00\x01"), reply(1, SET_GAIN, b"\0")
 MUTE: list[Pair] = [(request(n, SERIAL), None) for n in (1, 2, 3)]
 ENDLESS: list[Pair] = [(SERIAL_REQUEST, [bytes(4096)] * (boson.MAXIMUM_RECEIVED // 4096 + 1))]
 
 
 @pytest.mark.parametrize(
-    ("reading", "answer", "error", "message"),
+    ("command", "answer", "error", "message"),
     [
         (SERIAL, MUTE, BosonTimeoutError, "No reply to 'serial number' within 1 s"),
         (SERIAL, ENDLESS, BosonError, "within 65536 bytes"),
@@ -151,30 +153,17 @@ ENDLESS: list[Pair] = [(SERIAL_REQUEST, [bytes(4096)] * (boson.MAXIMUM_RECEIVED 
         (SERIAL, reply(1, SERIAL, status=0x999), BosonError, "0x999, unknown"),
         (STATUS, reply(1, STATUS, b"\0\0\0\x09"), BosonError, "9 is not a valid FfcStatus"),
         (PART, reply(1, PART, b"\xff" * 20), BosonError, "Invalid reply to 'part number'"),
+        (SET_GAIN, [(LOW_GAIN, None)], BosonTimeoutError, "No reply to 'set gain mode'"),
+        (SET_GAIN, [(LOW_GAIN, ONE_BYTE)], BosonError, "reply of 1 bytes to 'set gain mode'"),
     ],
 )
-def test_readings_that_fail(
-    reading: int, answer: bytes | list[Pair], error: type[BosonError], message: str
+def test_exchanges_that_fail(
+    command: int, answer: bytes | list[Pair], error: type[BosonError], message: str
 ) -> None:
-    """A mute camera is asked three times; other replies are errors with what is wrong."""
-    (entries,) = (r for r in vars(boson).values() if getattr(r, "command", None) == reading)
-    pairs = [(request(1, reading), answer)] if isinstance(answer, bytes) else answer
+    """A mute camera is asked three times, but set once; other replies are errors that say why."""
+    pairs = [(request(1, command), answer)] if isinstance(answer, bytes) else answer
     with Dialogue(pairs) as line, pytest.raises(error, match=message):
-        camera_of(line).read(entries)
-
-
-@pytest.mark.parametrize(
-    ("answer", "error", "message"),
-    [
-        (None, BosonTimeoutError, "No reply to 'set gain mode'"),
-        (reply(1, SET_GAIN, b"\0"), BosonError, "reply of 1 bytes to 'set gain mode'"),
-    ],
-)
-def test_a_change_is_sent_once(answer: bytes | None, error: type[BosonError], message: str) -> None:
-    """A command that changes the camera is never sent twice, and answered without data."""
-    line = Dialogue([(request(1, SET_GAIN, b"\x00\x00\x00\x01"), answer)])
-    with line, pytest.raises(error, match=message):
-        camera_of(line).set(boson.GAIN_MODE, GainMode.LOW)
+        ASKED[command](camera_of(line))
 
 
 blobs = st.lists(st.binary(max_size=60), max_size=6)
@@ -208,14 +197,16 @@ def test_the_emulator_refuses_what_the_driver_never_sends(
 @pytest.mark.parametrize("stalls", [False, True])
 def test_a_correction_is_waited_for(bench: BosonBench, stalls: bool) -> None:
     """A correction is awaited for the shutter's time, also while the camera does not answer."""
-    bench.device.stalls = stalls
+    replies, state = bench.device.poll, bench.state
+    if stalls:
+        vars(bench.device)["poll"] = lambda: [] if bench.clock() < state.ffc_until else replies()
     for number in (1, 2):
-        start = bench.clock.now
+        start = bench.clock()
         frame = bench.camera.run_ffc()
-        assert FFC_DURATION <= bench.clock.now - start < FFC_DURATION + 0.2
-        assert (bench.state.ffc_count, bench.state.last_ffc_frame) == (number, frame)
+        assert FFC_DURATION <= bench.clock() - start < FFC_DURATION + 0.2
+        assert (state.ffc_count, state.last_ffc_frame) == (number, frame)
     assert bench.camera.ffc_status() is FfcStatus.COMPLETE
-    bench.state.has_frames, bench.state.frame_count = True, 41
+    state.has_frames, state.frame_count = True, 41
     assert bench.camera.run_ffc() == 41  # on the count of the frame source, if there is one
 
 
@@ -239,11 +230,11 @@ def test_a_correction_that_is_slow_to_start_is_waited_for() -> None:
 def test_a_correction_that_takes_too_long_is_an_error(bench: BosonBench, answers: int) -> None:
     """A wait outlasts its limit, which the error gives, by the time of one reply at most."""
     bench.camera.run_ffc()
-    bench.device.answers = answers
-    start = bench.clock.now
+    start, receive, remaining = bench.clock(), bench.device.receive, iter(range(answers))
+    vars(bench.device)["receive"] = lambda data: next(remaining, -1) < 0 or receive(data)
     with pytest.raises(BosonTimeoutError, match=r"No flat-field correction within 0\.2 s"):
         bench.camera.run_ffc(timeout=0.2)
-    assert bench.clock.now - start <= 0.2 + REPLY_TIMEOUT + 0.2
+    assert bench.clock() - start <= 0.2 + boson.REPLY_TIMEOUT + 0.2
 
 
 def test_each_program_begins_at_another_number() -> None:
@@ -282,22 +273,16 @@ def test_threads_take_turns_until_the_end() -> None:
     world = World(clock=SYSTEM)
     world.add_camera("boson", 93588)
     camera = Boson(line := Slow(world, "boson"))
-    errors: list[TransportError] = []
 
-    def ask() -> None:
-        try:
-            while True:
-                assert camera.serial_number() == 93588
-                assert camera.fpa_temperature() == pytest.approx(308.15, abs=0.05)
-        except TransportError as error:
-            errors.append(error)
+    def ask() -> NoReturn:
+        while True:
+            assert camera.serial_number() == 93588
+            assert camera.fpa_temperature() == pytest.approx(308.15, abs=0.05)
 
-    threads = [threading.Thread(target=ask) for _ in range(2)]
-    for thread in threads:
-        thread.start()
-    time.sleep(0.2)
-    for _ in range(2):
-        camera.close()
-    for thread in threads:
-        thread.join()
-    assert (len(errors), line.overlaps) == (2, 0)
+    with ThreadPoolExecutor(2) as pool:
+        asked = [pool.submit(ask) for _ in range(2)]
+        time.sleep(0.2)
+        for _ in range(2):
+            camera.close()
+    assert {type(future.exception()) for future in asked} == {TransportError}
+    assert line.overlaps == 0

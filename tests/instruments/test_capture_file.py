@@ -2,7 +2,7 @@
 
 import errno
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +16,8 @@ from hypothesis import strategies as st
 from refused import refused
 
 from dbthermal import store
-from dbthermal.instruments import telemetry
-from dbthermal.instruments.camera import (
-    DAMAGED,
-    GOOD,
-    FfcStatus,
-    Frame,
-    FrameFlag,
-    Shutter,
-    camera_kind,
-    next_shutter,
-)
+from dbthermal.instruments import camera, telemetry
+from dbthermal.instruments.camera import DAMAGED, GOOD, FfcStatus, Frame, FrameFlag, next_shutter
 from dbthermal.instruments.recording import notes
 from dbthermal.instruments.recording._capture_file import CaptureFile, Note
 
@@ -82,15 +73,10 @@ FRAMES: dict[str, tuple[list[Frame], list[int], list[float]]] = {
         [0, 0.01, math.nan, math.nan, 0.03, math.nan, 0.05],
     ),
     # A stamp after the host's, or before the start, is invalid for its own frame alone.
-    "a stamp of the future": (
-        [shot(0), shot(1, device_time=500.0), shot(2), shot(3)],
-        [0, FrameFlag.TIME_WRONG, 0, 0],
-        [0, math.nan, 0.02, 0.03],
-    ),
-    "a stamp of the past": (
-        [shot(0), shot(1, device_time=-500.0), shot(2), shot(3)],
-        [0, FrameFlag.TIME_WRONG, 0, 0],
-        [0, math.nan, 0.02, 0.03],
+    "stamps of the future and the past": (
+        [shot(0), shot(1, device_time=500.0), shot(2), shot(3, device_time=-500.0), shot(4)],
+        [0, FrameFlag.TIME_WRONG, 0, FrameFlag.TIME_WRONG, 0],
+        [0, math.nan, 0.02, math.nan, 0.04],
     ),
     # A camera's own clock has another origin: it is not compared with the host's.
     "a clock of its own": (
@@ -207,23 +193,23 @@ def numbers(field: telemetry.Field) -> st.SearchStrategy[float]:
     return every.map(lambda number: number / field.steps + field.zero) if field.steps else every
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "offset", "expected"),
-    [
-        ("frame_counter", 1234567, 84, "12 00 87 D6"),
-        ("fpa_temperature", 311.2, 94, "28 0C"),
-        ("uptime", 20576.117, 280, "39 01 75 F7"),
-    ],
-)
-def test_vectors(name: str, value: float, offset: int, expected: str) -> None:
-    """The bytes in the buffer are those of the public decoders, both ways."""
-    wanted = bytes.fromhex(expected)
-    result = telemetry.encode({name: value}, COLUMNS).astype("<u2").tobytes()
-    assert result[offset : offset + len(wanted)] == wanted
-    buffer = bytearray(2 * telemetry.WORDS)
-    buffer[offset : offset + len(wanted)] = wanted
+# Field, value, byte and bytes of it, by the public decoders.
+VECTORS = [
+    ("frame_counter", 1234567, 84, "12 00 87 D6"),
+    ("fpa_temperature", 311.2, 94, "28 0C"),
+    ("uptime", 20576.117, 280, "39 01 75 F7"),
+]
+
+
+def test_fields_have_the_published_bytes() -> None:
+    """The bytes in the buffer are those of the public decoders, both ways, and 0 elsewhere."""
+    values, buffer = {name: value for name, value, _, _ in VECTORS}, bytearray(2 * telemetry.WORDS)
+    for _, _, offset, line in VECTORS:
+        buffer[offset : offset + len(bytes.fromhex(line))] = bytes.fromhex(line)
+    encoded = telemetry.encode(values, COLUMNS).astype("<u2").tobytes()
+    assert encoded == bytes(buffer).ljust(len(encoded), b"\0")
     decoded = telemetry.decode(np.frombuffer(bytes(buffer), dtype="<u2"))
-    assert decoded[name] == pytest.approx(value, abs=1e-9)
+    assert {name: decoded[name] for name in values} == pytest.approx(values, abs=1e-9)
 
 
 @given(st.fixed_dictionaries({name: numbers(field) for name, field in telemetry.FIELDS.items()}))
@@ -243,21 +229,9 @@ test_wrong_telemetry_is_refused = refused(
         (telemetry.decode, np.zeros(10, np.uint16), "telemetry of 10 words. Must hold 142"),
         (telemetry.decode, np.zeros(1280, np.float32), "telemetry of float32. Must be uint16"),
         (telemetry.encode, {"frame_counter": 2**32}, COLUMNS, "Invalid frame_counter of 42949672"),
-        (camera_kind, "lepton", "Unknown kind of camera 'lepton'. Must be one of ['"),
+        (camera.camera_kind, "lepton", "Unknown kind of camera 'lepton'. Must be one of ['"),
     ],
 )
-
-
-def closed(
-    copies: str, last: Sequence[int | None] | None, status: Sequence[FfcStatus | None] | None
-) -> str:
-    """Frames that count as closed, x, of frames that repeat the image before, also x."""
-    state, result = Shutter(), ""
-    nothing = [None] * len(copies)
-    for mark, frame, read in zip(copies, last or nothing, status or nothing, strict=True):
-        state = next_shutter(state, repeated=mark == "x", last_ffc_frame=frame, ffc_status=read)
-        result += "x" if state.closed else "."
-    return result
 
 
 IMMINENT, BUSY, DONE = FfcStatus.IMMINENT, FfcStatus.IN_PROGRESS, FfcStatus.COMPLETE
@@ -287,8 +261,12 @@ IMMINENT, BUSY, DONE = FfcStatus.IMMINENT, FfcStatus.IN_PROGRESS, FfcStatus.COMP
 def test_rule_of_the_shutter(
     copies: str, last: list[int | None] | None, status: list[FfcStatus] | None, expected: str
 ) -> None:
-    """The shutter is closed by a renewal, a reading or a run of copies."""
-    assert closed(copies, last, status) == expected
+    """The shutter is closed, x, by a renewal, a reading or a run of copies, also x."""
+    state, closed, nothing = camera.Shutter(), "", [None] * len(copies)
+    for mark, frame, read in zip(copies, last or nothing, status or nothing, strict=True):
+        state = next_shutter(state, repeated=mark == "x", last_ffc_frame=frame, ffc_status=read)
+        closed += "x" if state.closed else "."
+    assert closed == expected
 
 
 FFC_STATUS = st.none() | st.sampled_from(FfcStatus)
@@ -299,7 +277,7 @@ def test_a_changing_image_is_closed_by_a_renewal_alone(
     frames: list[tuple[bool, int | None, FfcStatus | None]],
 ) -> None:
     """A frame with a new image is marked only if the number of the last correction changed."""
-    state = Shutter()
+    state = camera.Shutter()
     for repeated, last, status in frames:
         after = next_shutter(state, repeated=repeated, last_ffc_frame=last, ffc_status=status)
         renewed = None not in {last, state.last_ffc_frame} and last != state.last_ffc_frame

@@ -2,13 +2,14 @@
 
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
 from faulty_devices import BosonBench, LoggerBench
-from rig_session import TEXT, bench, from_yaml, pictures, replaced, rig
+from rig_session import bench, from_yaml, pictures, replaced, rig
 
 from dbthermal.instruments import boson
-from dbthermal.instruments.boson import Boson, Ir16Mode, Switch
-from dbthermal.instruments.camera import FfcMode, FfcStatus
+from dbthermal.instruments.boson import Boson, FfcMode, Ir16Mode, Switch
+from dbthermal.instruments.camera import FfcStatus
 from dbthermal.instruments.devices import Devices, open_devices
 from dbthermal.instruments.filterwheel import NotHomedError
 from dbthermal.instruments.tc08 import ReadingError
@@ -18,7 +19,7 @@ from dbthermal.instruments.transport import TransportError
 @pytest.fixture
 def devices() -> Iterator[Devices]:
     """Open the whole rig on emulators."""
-    with rig(from_yaml(TEXT)) as opened:
+    with rig(from_yaml()) as opened:
         yield opened
 
 
@@ -40,7 +41,7 @@ def test_every_device_says_what_it_is(devices: Devices) -> None:
 
 def test_whole_rig_is_closed() -> None:
     """All devices of the file are closed in the end."""
-    with rig(from_yaml(TEXT)) as devices:
+    with rig(from_yaml()) as devices:
         assert devices.wheel is not None
         assert devices.thermocouples is not None
     for ask in (devices.wheel.status, *(port.fpa_temperature for port in devices.cameras.values())):
@@ -55,21 +56,16 @@ def test_whole_rig_is_closed() -> None:
 
 def test_readings_are_named(devices: Devices) -> None:
     """Thermocouples, focal planes, shutters and wheel are read by their drivers, with units."""
-    assert devices.world is not None
     devices.world.blackbody_temperature = 300.0
     devices.world.camera("9.5").fpa_temperature = 311.25
     devices.prepare()
     readings = devices.readings()
-    names = {name: reading.read() for name, reading in readings.items()}
-    expected = {"blackbody": 300.0, "plate": 330.0, "fpa 8-14": 308.15, "fpa 9.5": 311.25}
-    expected |= {"ffc 8-14": 3.0, "ffc 9.5": 3.0, "filter_wheel": 1.0}
-    assert names == pytest.approx(expected, abs=1e-4)  # a thermocouple is of 32 bits
+    kelvin = {"blackbody": 300.0, "plate": 330.0, "fpa 8-14": 308.15, "fpa 9.5": 311.25}
+    plain = {"ffc 8-14": 3.0, "ffc 9.5": 3.0, "filter_wheel": 1.0}
+    values = {name: reading.read() for name, reading in readings.items()}
+    assert values == pytest.approx({**kelvin, **plain}, abs=1e-4)  # a thermocouple is of 32 bits
     units = {name: reading.units for name, reading in readings.items()}
-    assert {name for name, unit in units.items() if unit == "1"} == {
-        "ffc 8-14",
-        "ffc 9.5",
-        "filter_wheel",
-    }
+    assert units == {**dict.fromkeys(kelvin, "K"), **dict.fromkeys(plain, "1")}
 
 
 def test_prepared_for_a_measurement(devices: Devices) -> None:
@@ -77,12 +73,11 @@ def test_prepared_for_a_measurement(devices: Devices) -> None:
     devices.prepare()
     for camera in devices.cameras.values():
         assert isinstance(camera, Boson)
-        assert camera.get(boson.IR16_MODE) == Ir16Mode.COUNTS_16
-        assert camera.get(boson.FFC_MODE) == FfcMode.MANUAL
-        assert camera.get(boson.TELEMETRY) == Switch.ON
+        assert camera.read(boson.IR16_MODE) == Ir16Mode.COUNTS_16
+        assert camera.read(boson.FFC_MODE) == FfcMode.MANUAL
+        assert camera.read(boson.TELEMETRY) == Switch.ON
         assert camera.ffc_status() == FfcStatus.COMPLETE
     assert devices.wheel is not None
-    assert devices.world is not None
     assert (devices.wheel.band(), devices.world.filter_name) == ("9.5", "9.5")
     assert devices.world.camera("8-14").ffc_count == 1
 
@@ -97,10 +92,10 @@ class Kept(dict[int, int]):
 def test_setting_that_is_not_taken_is_an_error() -> None:
     """A camera that acknowledges a setting but does not change raises an error."""
     bench = BosonBench()
-    bench.device.settings = Kept({**bench.device.settings, boson.IR16_MODE.set_command: 2})
+    bench.device.settings = Kept({**bench.device.settings, boson.IR16_MODE.command: 2})
     message = r"Invalid IR16 mode .*TLINEAR.* of camera 93588, set to .*COUNTS_16.* Must be"
     with pytest.raises(ValueError, match=message):
-        Devices(from_yaml(TEXT), {}, {"9.5": bench.camera}).prepare()
+        Devices(from_yaml(), {}, {"9.5": bench.camera}).prepare()
 
 
 def test_camera_is_called_by_the_filter_in_the_beam(devices: Devices) -> None:
@@ -120,7 +115,6 @@ def test_camera_is_called_by_the_filter_in_the_beam(devices: Devices) -> None:
 
 def test_frames_that_wait_are_thrown_away(devices: Devices) -> None:
     """After a flush the next frame is one that was exposed after it."""
-    assert devices.world is not None
     source = devices.sources["8-14"]
     source.read()
     devices.clock.sleep(0.05)
@@ -136,15 +130,16 @@ def test_one_scan_gives_all_channels_once() -> None:
 
     def read(channel: int, rise: float) -> float:
         """Reading of a channel [K] where the tips are warmer than at first by a rise [K]."""
-        bench.tips = {1: 350.0 + rise, 2: 300.0 + rise}
+        bench.tips = {"plate": 350.0 + rise, "room": 300.0 + rise}
         return round(thermocouples.read(channel), 3)
 
     assert [read(1, 0.0), read(2, 1.0)] == [350.0, 300.0]
     assert [read(2, 2.0), read(2, 3.0)] == [302.0, 303.0]
     bench.clock.sleep(1.1)  # the value that was not read yet is too old
     assert read(1, 4.0) == 354.0
-    for fault in ("open", "overflow"):
-        vars(bench.unit.faults).update({"open": set(), "overflow": set(), fault: {2}})
+    for fault, tip in (("open", (np.nan, False)), ("overflow", (673.15, True))):
+        convert = {1: (354.0, False), 2: tip}.get
+        vars(bench.unit)["convert"] = lambda channel, tips=convert: tips(channel, (296.15, False))
         bench.clock.sleep(1.1)
         with pytest.raises(ReadingError, match=f"thermocouple 'room' in channel 2: {fault}. Must"):
             thermocouples.read(2)

@@ -5,11 +5,13 @@
 
 import hashlib
 import math
-import multiprocessing
 import os
+import subprocess
+import sys
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -18,7 +20,7 @@ import numpy as np
 import pytest
 import rig_session
 from faulty_camera import frames
-from faulty_devices import Clock
+from faulty_devices import clock_at
 from rig_session import LIMIT, bench, from_yaml, replaced, rig, scene_text
 
 from dbthermal.instruments import protocols, telemetry
@@ -37,7 +39,7 @@ def level(counts: int) -> Picture:
 
 def camera(band: str | None = "8-14", rows: int = 0, **scene: Any) -> EmulatedCamera:
     """A camera on a bench with a wheel of two filters, on a simulated clock."""
-    world = World(clock=Clock(1000.0), filters={1: "9.5", 2: "11"}, **scene)
+    world = World(clock=clock_at(1000.0), filters={1: "9.5", 2: "11"}, **scene)
     world.add_camera("wide", 93588)
     pictures = {"8-14": level(1000), "9.5": level(2000), "11": level(3000)}
     return EmulatedCamera(world, "wide", pictures, band, SHAPE, RATE, rows)
@@ -105,20 +107,22 @@ def test_what_does_not_fit_the_bench_is_named() -> None:
     source = camera(band="12", scene=lambda time: {"plate": 300.0 + time})
     world = source.world
     world.thermocouples.update({1: "plate", 2: "blackbody", 4: "moon"})
-    assert [world.thermocouple_temperature(channel) for channel in (1, 2)] == [300.0, 296.15]
-    with pytest.raises(KeyError, match="Unknown band '12'"):
-        source.read()
+    tips = [world.thermocouple_temperature(channel) for channel in (1, 2, 3)]
+    np.testing.assert_array_equal(tips, [300.0, 296.15, np.nan])
+    refusals: list[tuple[Callable[[], object], str]] = [
+        (source.read, "Unknown band '12'"),
+        (lambda: EmulatedCamera(world, "narrow", {}), "Unknown camera 'narrow'"),
+        (lambda: world.thermocouple_temperature(4), "Unknown place of thermocouple 4 'moon'"),
+    ]
+    for call, message in refusals:
+        with pytest.raises(KeyError, match=message):
+            call()
+    with pytest.raises(ValueError, match="Repeated camera 'wide'"):
+        world.add_camera("wide", 2)
     for picture in (np.zeros((3, 4), dtype=np.uint16), np.zeros(SHAPE)):
         source.pictures = {"12": Mock(return_value=picture)}
         with pytest.raises(ValueError, match=r"Invalid picture .* Must be \(8, 80\) of uint16"):
             source.read()
-    with pytest.raises(KeyError, match="Unknown camera 'narrow'"):
-        EmulatedCamera(world, "narrow", {})
-    with pytest.raises(ValueError, match="Repeated camera 'wide'"):
-        world.add_camera("wide", 2)
-    assert np.isnan(world.thermocouple_temperature(3))
-    with pytest.raises(KeyError, match="Unknown place of thermocouple 4 'moon'"):
-        world.thermocouple_temperature(4)
 
 
 LIMITS = Limits(chunk=30, reserve=0, queue=3)
@@ -137,13 +141,9 @@ def recorded(folder: Path) -> dict[str, str]:
 
     with rig(SWEEP) as devices:
         devices.prepare()
-        protocols.record_sweep(
-            devices,
-            folder,
-            set_temperature=lambda kelvin: vars(devices.world).update(blackbody_temperature=kelvin),
-            limits=LIMITS,
-            preview=show,
-        )
+        heat = partial(setattr, devices.world, "blackbody_temperature")
+        options: Any = {"set_temperature": heat, "limits": LIMITS, "preview": show}
+        protocols.record_sweep(devices, folder, **options)
     with rig(SCENE) as devices:
         devices.prepare()
         protocols.record_scene(devices, folder / "scene.zarr", limits=LIMITS, preview=show)
@@ -155,53 +155,26 @@ def recorded(folder: Path) -> dict[str, str]:
     return {**files, "previews": str(order)}
 
 
-def spin() -> None:
-    """Keep a core busy."""
-    while True:
-        pass
-
-
-@contextmanager
-def load(processes: int) -> Iterator[None]:
-    """Keep the computer busy with some processes."""
-    context = multiprocessing.get_context("spawn")
-    busy = [context.Process(target=spin, daemon=True) for _ in range(processes)]
-    for process in busy:
-        process.start()
-    try:
-        yield
-    finally:
-        for process in busy:
-            process.kill()
-            process.join()
-
-
-@contextmanager
-def single_core() -> Iterator[None]:
-    """Run on one core, where the system can tell a process so."""
-    if not hasattr(os, "sched_setaffinity"):
-        pytest.skip("the system does not bind a process to a core")
-    before = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {min(before)})
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, before)
-
-
 def test_a_recording_has_the_same_bytes_under_load_and_on_one_core(tmp_path: Path) -> None:
     """Every file of a sweep and of a scene is the same, at rest, under load and on one core."""
     first = recorded(tmp_path / "rest")
     assert len(first) > 100
-    with load(2):
+    with ExitStack() as stack:
+        for _ in range(2):
+            busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+            stack.callback(stack.enter_context(busy).kill)
         assert recorded(tmp_path / "load") == first
-    with single_core():
-        assert recorded(tmp_path / "core") == first
     capture = open_capture(tmp_path / "load" / "scene.zarr")
     assert capture.attrs["started"].startswith(f"{START:%Y-%m-%dT}")
     totals = capture.attrs["totals"]
     assert {band: total["frames"] for band, total in totals.items()} == {"8-14": 120, "9.5": 121}
     assert all(total["refused"] == total["lost"] == 0 for total in totals.values())
+    if not hasattr(os, "sched_setaffinity"):
+        pytest.skip("the system does not bind a process to a core")
+    with ExitStack() as stack:
+        stack.callback(os.sched_setaffinity, 0, cores := os.sched_getaffinity(0))
+        os.sched_setaffinity(0, {min(cores)})
+        assert recorded(tmp_path / "core") == first
 
 
 def test_real_time_is_an_option() -> None:

@@ -7,25 +7,21 @@ checked against its frames (`CheckedRecording`).
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import pairwise
+from itertools import chain, pairwise, repeat
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import xarray as xr
-from faulty_camera import BANDS, Faults, FaultyCamera, two_bands, two_cameras
+from faulty_camera import BANDS, Faults, two_bands, two_cameras
 
 from dbthermal import store
+from dbthermal.instruments import filterwheel
 from dbthermal.instruments.boson import BosonError, BosonTimeoutError
 from dbthermal.instruments.camera import DAMAGED, UNTIMED, Counts, Frame, FrameFlag
 from dbthermal.instruments.emulated import World
-from dbthermal.instruments.filterwheel import (
-    NoReplyError,
-    NotHomedError,
-    StalledWheelError,
-    WheelError,
-)
 from dbthermal.instruments.recording import Limits, Reading, notes, open_capture, record
 from dbthermal.instruments.tc08 import ReadingError, TC08Error
 from dbthermal.instruments.transport import TransportError
@@ -43,20 +39,6 @@ def picture(time: float) -> Counts:
     return (PATTERN + round(time / MILLI)).astype(np.uint16)
 
 
-class Witness(FaultyCamera):
-    """An emulated camera that keeps a copy of every frame that it gave."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.frames: list[Frame] = []
-
-    def read(self, timeout: float = 1.0) -> Frame:
-        """Give a frame, and keep a copy."""
-        frame = super().read(timeout)
-        self.frames.append(replace(frame, counts=frame.counts.copy()))
-        return frame
-
-
 @dataclass
 class CheckedRecording:
     """One recording on two emulated cameras, with their faults and the frames that they gave."""
@@ -66,15 +48,16 @@ class CheckedRecording:
     world: World = field(default_factory=World)
 
     def __post_init__(self) -> None:
-        self.cameras = two_cameras(
-            picture, SHAPE, RATE, faults=self.faults, world=self.world, kind=Witness
-        )
+        self.frames: dict[str, list[Frame]] = {band: [] for band in BANDS}
+        self.cameras = two_cameras(picture, SHAPE, RATE, faults=self.faults, world=self.world)
+        for band, camera in self.cameras.items():
+            vars(camera)["read"] = partial(self.witness, band, camera.read)
 
-    def frames(self, band: str) -> list[Frame]:
-        """Frames that the camera of a band gave."""
-        camera = self.cameras[band]
-        assert isinstance(camera, Witness)
-        return camera.frames
+    def witness(self, band: str, read: Callable[[float], Frame], timeout: float) -> Frame:
+        """Read a frame, and keep a copy."""
+        frame = read(timeout)
+        self.frames[band].append(replace(frame, counts=frame.counts.copy()))
+        return frame
 
     def record(
         self, duration: float, readings: Mapping[str, Read] | None = None
@@ -105,45 +88,40 @@ class CheckedRecording:
 
     def check(self, band: str) -> None:
         """Check that all frames are stored unchanged, each with its time, and losses counted."""
-        frames, kept = self.frames(band), self.stored(band)
+        frames, kept, faults = self.frames[band], self.stored(band), self.cameras[band].faults
+        flags, totals = kept["frame_flags"].values, self.summary.totals[band]
+
+        def flagged(flag: FrameFlag) -> Any:
+            return flags & int(flag) > 0
+
+        # All frames, unchanged.
         assert len(frames) == kept.sizes["time"] > 0
-        np.testing.assert_array_equal(kept["counts"], [frame.counts for frame in frames])
-        np.testing.assert_array_equal(kept["sequence"], [frame.sequence for frame in frames])
-        np.testing.assert_array_equal(kept["device_time"], [frame.device_time for frame in frames])
-        flags = kept["frame_flags"].values
+        for name in ("counts", "sequence", "device_time"):
+            np.testing.assert_array_equal(kept[name], [getattr(frame, name) for frame in frames])
         np.testing.assert_array_equal(flags & SOURCE_FLAGS, [int(frame.flags) for frame in frames])
         repeats = [np.array_equal(a.counts, b.counts) for a, b in pairwise(frames)]
-        np.testing.assert_array_equal(flags[1:] & int(FrameFlag.IMAGE_REPEATED) > 0, repeats)
-        self.check_times(kept, flags, self.cameras[band].faults)
-        self.check_losses(band, frames, flags)
-
-    def check_times(self, kept: xr.Dataset, flags: Any, faults: Faults) -> None:
-        """Check that a frame has the time of its counts, or a flag that explains a missing time."""
+        np.testing.assert_array_equal(flagged(FrameFlag.IMAGE_REPEATED)[1:], repeats)
+        # A frame has the time of its counts, or a flag that explains a missing time.
         stamps = kept["exposure_time"].values
-        timed = (flags & int(UNTIMED | FrameFlag.FOREIGN_CLOCK)) == 0
+        timed = ~flagged(UNTIMED | FrameFlag.FOREIGN_CLOCK)
         np.testing.assert_array_equal(np.isfinite(stamps), timed)
-        lies = np.isin(kept["sequence"].values, [*faults.repeated])
-        still = FrameFlag.SHUTTER_CLOSED | FrameFlag.IMAGE_REPEATED
-        view_mask = timed & ((flags & int(still)) == 0) & ~lies
-        assert view_mask.any() or faults.clock_rate != 1
-        statement = MILLI * (kept["counts"].values[view_mask] - PATTERN.astype(float))
-        since = stamps[view_mask] + kept.attrs["clock_origin"]
+        still = flagged(FrameFlag.SHUTTER_CLOSED | FrameFlag.IMAGE_REPEATED)
+        shown = timed & ~still & ~np.isin(kept["sequence"].values, [*faults.repeated])
+        assert shown.any() or faults.clock_rate != 1
+        statement = MILLI * (kept["counts"].values[shown] - PATTERN.astype(float))
+        since = stamps[shown] + kept.attrs["clock_origin"]
         expected = np.broadcast_to(since[:, None, None], statement.shape)
         np.testing.assert_allclose(statement, expected, rtol=0, atol=0.51 * MILLI)
-
-    def check_losses(self, band: str, frames: list[Frame], flags: Any) -> None:
-        """Check that lost and damaged frames and the shutter are in the log and in the totals."""
-        leaps = np.diff([frame.sequence for frame in frames]) - 1
-        entries, totals = self.noted(band), self.summary.totals[band]
-        assert [value for kind, value in entries if kind == "frames_lost"] == list(leaps[leaps > 0])
+        # Lost and damaged frames and the shutter are in the log and in the totals.
+        leaps, kinds = np.diff([frame.sequence for frame in frames]) - 1, self.kinds(band)
+        lost = [value for kind, value in self.noted(band) if kind == "frames_lost"]
+        assert lost == list(leaps[leaps > 0])
         assert (totals["lost"], totals["refused"]) == (leaps.sum(), 0)
-        statement = flags[1:] & int(FrameFlag.FRAMES_LOST_BEFORE) > 0
-        np.testing.assert_array_equal(statement, leaps > 0)
+        np.testing.assert_array_equal(flagged(FrameFlag.FRAMES_LOST_BEFORE)[1:], leaps > 0)
         damaged = sum(bool(frame.flags & DAMAGED) for frame in frames)
-        assert self.kinds(band).count("damaged") == totals["damaged"] == damaged
-        closed = [bool(flag & int(FrameFlag.SHUTTER_CLOSED)) for flag in flags]
-        changes = sum(before != after for before, after in pairwise([False, *closed]))
-        assert sum(kind.startswith("shutter") for kind, _ in entries) == changes
+        assert kinds.count("damaged") == totals["damaged"] == damaged
+        changes = np.count_nonzero(np.diff([False, *flagged(FrameFlag.SHUTTER_CLOSED)]))
+        assert sum(kind.startswith("shutter") for kind in kinds) == changes
 
 
 # Cameras: faults of their frames.
@@ -178,11 +156,11 @@ def test_damaged_frames(name: str, tmp_path: Path) -> None:
 def test_an_unplugged_camera(tmp_path: Path) -> None:
     """The other camera is recorded to the end, and the store marks the end of each band."""
     recorded = CheckedRecording(tmp_path / "a.zarr", {"9.5": Faults(unplugged=12)}).record(0.6)
-    frames = recorded.frames("9.5")
+    frames = recorded.frames["9.5"]
     assert recorded.summary.ended == "source lost"
     assert recorded.noted("8-14") == []
     assert recorded.kinds("9.5")[-1] == "source_lost"
-    assert frames[-1].sequence < 12 < recorded.frames("8-14")[-1].sequence
+    assert frames[-1].sequence < 12 < recorded.frames["8-14"][-1].sequence
     opened = open_capture(recorded.path)
     after = opened.sel(band="9.5").isel(time=slice(len(frames), None))
     assert opened.attrs["complete"] is False
@@ -195,7 +173,7 @@ def test_a_clock_that_drifts(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"Invalid exposure times of band '9\.5': 0 stamps"):
         open_capture(recorded.path)
     fitted = open_capture(recorded.path, fitted=True)["exposure_time"].sel(band="9.5")
-    frames = recorded.frames("9.5")
+    frames = recorded.frames["9.5"]
     device, host = ([getattr(f, name) for f in frames] for name in ("device_time", "host_time"))
     line = np.polynomial.Polynomial.fit(device, host, 1)
     expected = line(np.array(device)) - store.open_dataset(recorded.path).attrs["clock_origin"]
@@ -206,21 +184,25 @@ def test_a_clock_that_drifts(tmp_path: Path) -> None:
 
 TROUBLES: list[Exception] = [
     *(BosonError("refused"), BosonTimeoutError("mute"), TransportError("unplugged")),
-    *(WheelError("motor hot"), NoReplyError("silent"), NotHomedError("lost")),
-    *(StalledWheelError("stuck"), ReadingError("open"), TC08Error("be read", 16)),
+    *(filterwheel.WheelError("motor hot"), filterwheel.NoReplyError("silent")),
+    *(filterwheel.NotHomedError("lost"), filterwheel.StalledWheelError("stuck")),
+    *(ReadingError("open"), TC08Error("be read", 16)),
 ]
 
 
 def test_an_instrument_that_fails_costs_no_frame(tmp_path: Path) -> None:
     """Slow readings go on beside a failing one; whatever its driver raises is noted as failed."""
     recorded = CheckedRecording(tmp_path / "a.zarr")
+    air = Mock(side_effect=chain([300.0, 301.0], repeat(TimeoutError("no answer"))))
 
     def fail(error: Exception) -> float:
         recorded.world.clock.sleep(0.002)
         raise error
 
     failing: dict[str, Read] = {type(error).__name__: partial(fail, error) for error in TROUBLES}
-    recorded.record(0.8, {**failing, "plate": lambda: 300.0})
+    recorded.record(0.8, {**failing, "air": air, "plate": lambda: 300.0})
     for name in failing:
         assert {*recorded.kinds(name)} == {"reading_failed"}
+    assert recorded.noted("air")[:2] == [("reading", 300.0), ("reading", 301.0)]
+    assert {*recorded.kinds("air")[2:]} == {"reading_failed"}
     assert {*recorded.noted("plate")} == {("reading", 300.0)}

@@ -7,12 +7,11 @@ from typing import Any
 
 import pytest
 from dialogue import Dialogue, Pair
-from faulty_devices import FILTERS, WheelBench
+from faulty_devices import WheelBench, WheelFaults, connected
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dbthermal.instruments.filterwheel import (
-    FilterWheel,
     NoReplyError,
     NotHomedError,
     StalledWheelError,
@@ -20,52 +19,50 @@ from dbthermal.instruments.filterwheel import (
 )
 from dbthermal.instruments.transport import TransportError
 
-SIXTHS = {
-    "BSC201": [0, 68_267, 136_533, 204_800, 273_067, 341_333],
-    "SCC201": [0, 68_267, 136_533, 204_800, 273_067, 341_333],
-    "BSC101": [0, 4267, 8533, 12_800, 17_067, 21_333],
-}
-"""Places of the slots [count], rounded each by itself."""
-
-# Speeds of 1 turn/s and 1 turn/s^2 in the numbers that thorlabs_apt_device has.
-TURNS = {"BSC201": (4506, 21_987_328), "SCC201": (4506, 21_987_328), "BSC101": (25_600, 25_600)}
+RACK = [0, 68_267, 136_533, 204_800, 273_067, 341_333], (4506, 21_987_328), "0x11, 0x21"
+UNIT = [0, 4267, 8533, 12_800, 17_067, 21_333], (25_600, 25_600), "0x50, 0x50"
+MODELS = {"BSC201": RACK, "SCC201": RACK, "BSC101": UNIT}
+"""Places of the slots [count], rounded each by itself; speeds of 1 turn/s^2 and 1 turn/s in the
+numbers that thorlabs_apt_device has; addresses."""
 
 
-@pytest.mark.parametrize("model", SIXTHS)
+@pytest.mark.parametrize("model", MODELS)
 def test_every_slot_turns_into_the_beam(model: str) -> None:
     """Rack or not, and whatever it calls itself: home, then every slot is where it should be."""
-    bench = WheelBench(model)
-    wheel = bench.homed()
-    slots = (6, 1, 2, 5, 3, 4)
+    bench, (places, speeds, addresses) = WheelBench(model), MODELS[model]
+    wheel, slots = bench.homed(), (6, 1, 2, 5, 3, 4)
     for position in slots:
         wheel.move_to(position)
         assert (wheel.position(), bench.world.wheel_position) == (position, position)
     assert wheel.is_simulated
-    assert wheel.identity()["model"] == model
-    assert wheel.identity()["addresses"] == ("0x50, 0x50" if model == "BSC101" else "0x11, 0x21")
+    identity = wheel.identity()
+    assert (identity["model"], identity["addresses"]) == (model, addresses)
     moves = [struct.unpack("<Hi", data)[1] for data in bench.device.sent("MOT_MOVE_ABSOLUTE")]
-    assert moves == [SIXTHS[model][slot - 1] for slot in slots]
-    speeds = struct.unpack("<Hiii", bench.device.sent("MOT_SET_VELPARAMS")[0])
-    assert speeds == (1, 0, *TURNS[model])
+    assert moves == [places[slot - 1] for slot in slots]
+    sent = struct.unpack("<Hiii", bench.device.sent("MOT_SET_VELPARAMS")[0])
+    assert sent == (1, 0, *speeds)
     order = [message.id for message in bench.device.received]
     assert max(order.index(0x0210), order.index(0x0440)) < order.index(0x0443)  # enabled, then home
 
 
+@pytest.fixture
+def bench() -> WheelBench:
+    """A bench whose wheel was homed."""
+    (bench := WheelBench()).homed()
+    return bench
+
+
 @pytest.mark.parametrize("turns", [-1, 1])
-def test_slots_of_any_turn(turns: int) -> None:
+def test_slots_of_any_turn(bench: WheelBench, turns: int) -> None:
     """A wheel that was turned on, by a whole turn and a sixth, has the next slot in the beam."""
-    bench = WheelBench()
-    wheel = bench.homed()
     bench.device.turn_to(turns * (409_600 + 68_267))
     bench.clock.sleep(30.0)
-    assert wheel.position() == bench.world.wheel_position == (2 if turns > 0 else 6)
+    assert bench.wheel.position() == bench.world.wheel_position == (2 if turns > 0 else 6)
 
 
-def test_filters_are_called_by_their_band() -> None:
+def test_filters_are_called_by_their_band(bench: WheelBench) -> None:
     """The band that is selected is the one that the world's camera then sees."""
-    bench = WheelBench()
-    wheel = bench.homed()
-    wheel.select("9.5")
+    (wheel := bench.wheel).select("9.5")
     assert (wheel.band(), bench.world.filter_name) == ("9.5", "9.5")
     with pytest.raises(ValueError, match=r"Invalid band 'MW' .* one of \['9.5', 'LW', 'open'\]"):
         wheel.select("MW")
@@ -75,21 +72,18 @@ def test_filters_are_called_by_their_band() -> None:
     with pytest.raises(WheelError, match="No filter in slot 2"):
         wheel.band()
     wheel.move_to(5)
-    later = FilterWheel(bench.device, FILTERS)
-    later.connect()  # a new program need not home the wheel again
+    later = connected(bench.device)  # a new program need not home the wheel again
     assert later.band() == "LW"
 
 
-def test_a_wheel_that_turns_or_rests_between_two_slots() -> None:
+def test_a_wheel_that_turns_or_rests_between_two_slots(bench: WheelBench) -> None:
     """It has no position and no filter in the beam, and is moved again once it was stopped."""
-    bench = WheelBench()
-    wheel = bench.homed()
     bench.device.turn_to(200_000)
     assert bench.world.wheel_position is None
     with pytest.raises(WheelError, match="still moving"):
-        wheel.position()
+        bench.wheel.position()
     bench.clock.sleep(0.5)
-    wheel.stop()
+    (wheel := bench.wheel).stop()
     with pytest.raises(WheelError, match=r"between two slots, at .* deg"):
         wheel.position()
     wheel.move_to(2)
@@ -99,14 +93,11 @@ def test_a_wheel_that_turns_or_rests_between_two_slots() -> None:
 def test_home_is_as_the_settings_say() -> None:
     """Direction and switch are sent; an offset of slot 1 is undone, and not detected if wrong."""
     bench = WheelBench(home_direction=1, home_limit_switch=4)
-    bench.homed().move_to(2)
-    assert struct.unpack("<HHHii", bench.device.sent("MOT_SET_HOMEPARAMS")[-1])[1:3] == (1, 4)
-    assert bench.world.wheel_position == 2
     right, wrong = WheelBench(slot_offset=12.5, home_offset=12.5), WheelBench(slot_offset=12.5)
-    right.homed().move_to(2)
-    wrong.homed().move_to(2)
-    assert right.world.wheel_position == right.wheel.position() == 2
-    assert (wrong.world.wheel_position, wrong.wheel.position()) == (None, 2)
+    for turned, slot in ((bench, 2), (right, 2), (wrong, None)):
+        turned.homed().move_to(2)
+        assert (turned.world.wheel_position, turned.wheel.position()) == (slot, 2)
+    assert struct.unpack("<HHHii", bench.device.sent("MOT_SET_HOMEPARAMS")[-1])[1:3] == (1, 4)
 
 
 def test_a_wheel_that_is_not_homed() -> None:
@@ -153,8 +144,7 @@ def test_dialogue_of_a_move() -> None:
         (ASK, status(68_267, 0x80000500)),
     ]
     with Dialogue([*PAIRS, *talk]) as dialogue:
-        wheel = FilterWheel(dialogue, FILTERS)
-        wheel.connect()
+        wheel = connected(dialogue)
         assert wheel.identity()["model"] == "BSC201"
         wheel.move_to(2)
 
@@ -167,9 +157,7 @@ def test_answers_of_others() -> None:
     enabled: Pair = (PAIRS[-1][0], [bytes.fromhex("12 02 01 01 01 21"), old])
     talk: Pair = (ASK, [other_bay + other_channel, answer])
     with Dialogue([*PAIRS[:-1], enabled, talk]) as dialogue:
-        wheel = FilterWheel(dialogue, FILTERS)
-        wheel.connect()
-        assert wheel.status().position == 3
+        assert connected(dialogue).status().position == 3
 
 
 BANNER = b"Command error CMD_NOT_DEFINED\r\n> "  # of an FW102C
@@ -188,7 +176,7 @@ STATES: list[Pair] = [(PAIRS[-1][0], bytes((0x12, 2, 1, state, 1, 0x21))) for st
 def test_answers_that_are_none(pairs: list[Pair], message: str) -> None:
     """Text, and a motor that is neither enabled nor not, raise an error on connecting."""
     with Dialogue(pairs) as dialogue, pytest.raises(WheelError, match=message):
-        FilterWheel(dialogue, FILTERS).connect()
+        connected(dialogue)
 
 
 class Babbler(Dialogue):
@@ -202,12 +190,10 @@ class Babbler(Dialogue):
 @given(st.lists(st.binary(max_size=40), max_size=6))
 def test_arbitrary_answers(answers: list[bytes]) -> None:
     """Connecting ends with a documented error for arbitrary answers, also if they never end."""
-    babbler = Babbler([(None, answers)] if answers else [])
     with pytest.raises(WheelError):
-        FilterWheel(babbler, FILTERS).connect()
-    endless = Babbler([(None, [bytes(256)] * 513)])
+        connected(Babbler([(None, answers)] if answers else []))
     with pytest.raises(WheelError, match="More than 65536 unsolicited bytes came"):
-        FilterWheel(endless, {}).connect()
+        connected(Babbler([(None, [bytes(256)] * 513)]))
 
 
 Case = tuple[dict[str, Any], type[WheelError], str]
@@ -216,7 +202,7 @@ REFUSED: list[Case] = [
     ({"deaf_to": "MOT_SET_HOMEPARAMS"}, WheelError, "home velocity 0. Must be 4397466"),
     ({"deaf_to": "MOD_SET_CHANENABLESTATE"}, WheelError, "did not enable the motor"),
     ({"weak": 0.98}, WheelError, r"The controller has velocity \d+\. Must be 21987328"),
-    ({"silent": True}, NoReplyError, "No APT controller answered at 0x11, 0x50. It must be"),
+    ({"deaf_to": "all"}, NoReplyError, "No APT controller answered at 0x11, 0x50. It must be"),
     ({"model": "KDC101"}, WheelError, "Wrong device 'KDC101', number 40000000"),
     ({"serial_number": 7}, WheelError, "Wrong controller 40000000. Must be 7"),
 ]
@@ -249,44 +235,45 @@ def test_controllers_that_are_refused(
     ],
     ids=lambda faults: next(iter(faults)),
 )
-def test_harmless_faults(faults: dict[str, object]) -> None:
+def test_harmless_faults(bench: WheelBench, faults: dict[str, object]) -> None:
     """Split, merged, late, missing, unasked and noisy answers: the wheel is where it should be."""
-    bench = WheelBench()
-    wheel = bench.homed()
     vars(bench.device.faults).update(faults)
     for position in (3, 6, 2):
-        wheel.move_to(position)
-        assert bench.world.wheel_position == position == wheel.position()
+        bench.wheel.move_to(position)
+        assert bench.world.wheel_position == position == bench.wheel.position()
 
 
 # Of a move to slot 3: fault, error, its text, if the wheel is stopped, and must then be homed.
 STALLS: list[tuple[dict[str, Any], type[WheelError], str, bool, bool]] = [
-    ({"stands_after": 20.0}, StalledWheelError, "120.00 deg: .* at 20.00 deg for 2", True, True),
+    ({"stands_at": 20.0}, StalledWheelError, "120.00 deg: .* at 20.00 deg for 2", True, True),
     # It still moves, however near to its target it is seen twice.
-    ({"stands_after": 119.95, "unreported": True}, StalledWheelError, "at 119.95 deg", True, True),
+    ({"stands_at": 119.95, "unreported": True}, StalledWheelError, "at 119.95 deg", True, True),
     ({"stops_short": 1.5}, StalledWheelError, "stopped at 118.50 deg. Must arrive", False, True),
     ({"deaf_to": "MOT_MOVE_ABSOLUTE"}, StalledWheelError, "did not start and is at 0", False, True),
     ({"stuck": "OVERLOAD"}, StalledWheelError, "OVERLOAD, and the wheel was stopped", True, True),
-    ({"slow": 30.0}, WheelError, "deg after 20.0 s, and was stopped", True, False),
-    ({"silent": True}, NoReplyError, "must be on and in no other program's use", False, False),
+    ({"slow": 100.0}, WheelError, "deg after 20.0 s, and was stopped", True, False),
+    ({"deaf_to": "all"}, NoReplyError, "must be on and in no other program's use", False, False),
     ({"notice": "motor hot"}, WheelError, "error 1 of message 0x0480: motor hot", False, False),
 ]
 
 
 @pytest.mark.parametrize(("faults", "error", "message", "stopped", "lost"), STALLS)
 def test_moves_that_fail(
-    faults: dict[str, Any], error: type[WheelError], message: str, stopped: bool, lost: bool
+    bench: WheelBench,
+    faults: dict[str, Any],
+    error: type[WheelError],
+    message: str,
+    stopped: bool,
+    lost: bool,
 ) -> None:
     """A move that fails is an error in bounded time; where steps may be lost, home comes first."""
-    bench = WheelBench()
-    wheel, healthy = bench.homed(), dict(vars(bench.device.faults))
-    vars(bench.device.faults).update(faults)
-    before = bench.clock.now
+    wheel, before = bench.wheel, bench.clock()
+    bench.device.faults = WheelFaults(**faults)
     with pytest.raises(error, match=message):
         wheel.move_to(3)
-    assert bench.clock.now - before < 30.0
+    assert bench.clock() - before < 30.0
     assert bool(bench.device.sent("MOT_MOVE_STOP")) == stopped
-    vars(bench.device.faults).update(healthy)
+    bench.device.faults = WheelFaults()
     if lost:
         with pytest.raises(NotHomedError, match="lost steps"):
             wheel.move_to(1)
@@ -299,41 +286,34 @@ def test_moves_that_fail(
     ("faults", "error", "message"),
     [
         ({"deaf_to": "MOT_MOVE_HOME"}, StalledWheelError, "Search for home: .* did not start"),
-        ({"slow": 30.0}, WheelError, "Search for home: .* after 60.0 s"),
+        ({"slow": 100.0}, WheelError, "Search for home: .* after 60.0 s"),
     ],
 )
 def test_searches_for_home_that_fail(
-    faults: dict[str, Any], error: type[WheelError], message: str
+    bench: WheelBench, faults: dict[str, Any], error: type[WheelError], message: str
 ) -> None:
     """Neither the state nor the report of an earlier search counts, and the position is lost."""
-    bench = WheelBench()
-    wheel = bench.homed()
-    wheel.move_to(4)
+    (wheel := bench.wheel).move_to(4)
     bench.device.receive(bytes.fromhex("43 04 01 00 21 01"))  # a search that no driver follows
     bench.clock.sleep(10.0)
     wheel.status()
     wheel.move_to(4)
-    vars(bench.device.faults).update(faults)
+    bench.device.faults = WheelFaults(**faults)
     with pytest.raises(error, match=message):
         wheel.home()
-    bench.device.faults.deaf_to = ""
+    bench.device.faults = WheelFaults()
     wheel.stop()
     with pytest.raises(NotHomedError, match="Must be homed"):
         wheel.position()
 
 
-def test_moving_bits_that_stick() -> None:
+def test_moving_bits_that_stick(bench: WheelBench) -> None:
     """With stuck motion bits a move ends by its report, and the next move raises an error."""
-    bench = WheelBench()
-    wheel = bench.homed()
-    stick = {"stuck": "MOVING_FORWARD"}
-    bench.clock.events.append(
-        (bench.clock.now + 0.3, lambda: vars(bench.device.faults).update(stick))
-    )
-    wheel.move_to(3)
+    bench.device.faults = WheelFaults(stuck="MOVING_FORWARD", stuck_from=bench.clock() + 0.3)
+    bench.wheel.move_to(3)
     assert bench.world.wheel_position == 3
     with pytest.raises(WheelError, match="still moving"):
-        wheel.move_to(4)
+        bench.wheel.move_to(4)
 
 
 def test_errors_of_the_greeting_are_logged_and_forgotten(caplog: pytest.LogCaptureFixture) -> None:
@@ -348,10 +328,9 @@ def test_errors_of_the_greeting_are_logged_and_forgotten(caplog: pytest.LogCaptu
         bench.wheel.home()
 
 
-def test_answers_that_come_too_late(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_answers_that_come_too_late(bench: WheelBench, monkeypatch: pytest.MonkeyPatch) -> None:
     """Answers later than the limit may be those of an older question: never a wrong slot."""
-    bench, patient = WheelBench(), WheelBench()
-    wheel = bench.homed()
+    patient, wheel = WheelBench(), bench.wheel
     bench.device.faults.late = patient.device.faults.late = 1.2
     wheel.move_to(3)
     assert bench.world.wheel_position == wheel.position() == 3
@@ -367,12 +346,11 @@ def test_answers_that_come_too_late(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_noise_on_the_line(noise: bytes, drop: int) -> None:
     """With any bytes before every answer, and some missing: the right slot, or a known error."""
     bench = WheelBench()
-    bench.device.faults.noise = noise
-    bench.device.faults.drop = drop
+    bench.device.faults = WheelFaults(noise=noise, drop=drop)
     try:
         bench.homed().move_to(2)
     except WheelError:
-        assert bench.clock.now < 200.0
+        assert bench.clock() < 200.0
     else:
         assert bench.world.wheel_position == 2
 

@@ -8,8 +8,6 @@ import os
 import pty
 import threading
 import tty
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import pytest
 from faulty_devices import FILTERS
@@ -77,8 +75,7 @@ def test_both_speak_the_same_to_a_wheel() -> None:
     assert (speeds.acceleration, speeds.max_velocity) == (4506, 21_987_328)
 
 
-@contextmanager
-def terminal(device: EmulatedBoson) -> Iterator[str]:
+def terminal(device: EmulatedBoson) -> str:
     """Path of a raw pseudo-terminal on which an emulated camera answers."""
     far, near = pty.openpty()
     tty.setraw(near)
@@ -89,7 +86,7 @@ def terminal(device: EmulatedBoson) -> Iterator[str]:
             os.write(far, b"".join(device.poll()))
 
     threading.Thread(target=serve, daemon=True).start()
-    yield os.ttyname(near)
+    return os.ttyname(near)
 
 
 def test_flirpy_understands_the_emulated_boson() -> None:
@@ -98,15 +95,14 @@ def test_flirpy_understands_the_emulated_boson() -> None:
     world = World()
     state = world.add_camera("boson", 93588)
     state.fpa_temperature = state.last_ffc_temperature = 273.15 + 43.1  # its checksum is escaped
-    with terminal(EmulatedBoson(world, "boson")) as path:
-        camera = flirpy.Boson(port=path)
-        assert (camera.get_camera_serial(), camera.get_fpa_temperature()) == (93588, 43.1)
-        assert camera.get_part_number().strip("\0 ") == "EMULATED-BOSON-640"
-        camera.set_ffc_manual()
-        camera.do_ffc()
-        assert (camera.get_ffc_mode(), camera.get_ffc_state(), state.ffc_count) == (0, 1, 1)
-        camera.set_ffc_auto()
-        assert camera.get_ffc_mode() == 1
-        state.fpa_temperature = 260.85
-        assert camera.get_fpa_temperature() == 6541.3
-        camera.close()
+    camera = flirpy.Boson(port=terminal(EmulatedBoson(world, "boson")))
+    assert (camera.get_camera_serial(), camera.get_fpa_temperature()) == (93588, 43.1)
+    assert camera.get_part_number().strip("\0 ") == "EMULATED-BOSON-640"
+    camera.set_ffc_manual()
+    camera.do_ffc()
+    assert (camera.get_ffc_mode(), camera.get_ffc_state(), state.ffc_count) == (0, 1, 1)
+    camera.set_ffc_auto()
+    assert camera.get_ffc_mode() == 1
+    state.fpa_temperature = 260.85
+    assert camera.get_fpa_temperature() == 6541.3
+    camera.close()

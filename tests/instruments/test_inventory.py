@@ -4,7 +4,6 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -19,39 +18,42 @@ from dbthermal.instruments.inventory import Device
 
 @dataclass
 class EmulatedDevice:
-    """One device that is plugged in; its serial number says that it is emulated."""
+    """A device that is plugged in, and its descriptor; the serial number says it is emulated."""
 
-    vendor: int
-    product: int
+    idVendor: int  # noqa: N815 - libusb's names
+    idProduct: int  # noqa: N815
     serial: str = "EMULATED"
     bus: int = 1
-    ports: tuple[int, ...] = (1,)  # on the way
+    port_numbers: tuple[int, ...] = (1,)  # on the way
     speed: int = 3  # as libusb numbers it; 2 is full, 3 high
     nodes: tuple[str, ...] = ()  # as sysfs lists them below the device's interfaces
 
     @property
-    def path(self) -> str:
-        """Bus and ports."""
-        return f"{self.bus}-{'.'.join(str(port) for port in self.ports)}"
+    def address(self) -> int:
+        """Number on the bus."""
+        return self.port_numbers[0]
+
+    def __getattr__(self, name: str) -> int:
+        """Any other number of the descriptor."""
+        return 1
 
 
 def boson(number: int = 1, **settings: Any) -> EmulatedDevice:
     """A camera with two video nodes and a serial one; `number`, from 1, is in all its names."""
-    defaults: dict[str, Any] = {"serial": f"EMULATED{number}", "ports": (number,)}
+    defaults: dict[str, Any] = {"serial": f"EMULATED{number}", "port_numbers": (number,)}
     video = (f"video4linux/video{index}" for index in (2 * number - 2, 2 * number - 1))
     defaults["nodes"] = (*video, f"tty/ttyACM{number - 1}")
     return EmulatedDevice(0x09CB, 0x4007, **{**defaults, **settings})
 
 
-def apt(**settings: Any) -> EmulatedDevice:
+def apt(nodes: tuple[str, ...] = ("ttyUSB0",)) -> EmulatedDevice:
     """An APT controller on its FTDI chip, at full speed."""
-    defaults: dict[str, Any] = {"ports": (3,), "speed": 2, "nodes": ("ttyUSB0",)}
-    return EmulatedDevice(0x0403, 0xFAF0, **{**defaults, **settings})
+    return EmulatedDevice(0x0403, 0xFAF0, port_numbers=(3,), speed=2, nodes=nodes)
 
 
-def tc08(**settings: Any) -> EmulatedDevice:
+def tc08(serial: str = "EMULATED") -> EmulatedDevice:
     """A TC-08, at full speed, without a kernel driver."""
-    return EmulatedDevice(0x0CE9, 0x1000, **{"ports": (4,), "speed": 2, **settings})
+    return EmulatedDevice(0x0CE9, 0x1000, serial, port_numbers=(4,), speed=2)
 
 
 class EmulatedBackend(usb.backend.IBackend):  # type: ignore[misc]
@@ -67,46 +69,27 @@ class EmulatedBackend(usb.backend.IBackend):  # type: ignore[misc]
         """List what is plugged in."""
         return iter(self.devices)
 
-    def get_device_descriptor(self, dev: EmulatedDevice) -> SimpleNamespace:
+    def get_device_descriptor(self, dev: EmulatedDevice) -> EmulatedDevice:
         """Give the device descriptor, with what libusb adds: bus, address, ports, speed."""
-        fixed = {
-            **dict.fromkeys(("bDeviceClass", "bDeviceSubClass", "bDeviceProtocol"), 0),
-            **dict.fromkeys(("bDescriptorType", "iSerialNumber", "bNumConfigurations"), 1),
-            **dict(zip(("bLength", "bcdUSB", "bMaxPacketSize0"), (18, 0x0200, 64), strict=True)),
-            **dict(zip(("bcdDevice", "iManufacturer", "iProduct"), (0x0100, 0, 0), strict=True)),
-        }
-        return SimpleNamespace(
-            **fixed,
-            idVendor=dev.vendor,
-            idProduct=dev.product,
-            address=dev.ports[0],
-            bus=dev.bus,
-            port_number=dev.ports[-1],
-            port_numbers=dev.ports,
-            speed=dev.speed,
-        )
-
-
-def write_trees(sysfs: Path, dev: Path, devices: tuple[EmulatedDevice, ...]) -> None:
-    """Write what Linux's sysfs would hold of the devices, and their nodes."""
-    for device in devices:
-        folder = sysfs / "bus" / "usb" / "devices" / device.path
-        folder.mkdir(parents=True)
-        if device.serial:
-            (folder / "serial").write_text(f"{device.serial}\n", encoding="utf-8")
-        usb_node = dev / f"bus/usb/{device.bus:03d}" / f"{device.ports[0]:03d}"
-        usb_node.parent.mkdir(parents=True, exist_ok=True)
-        usb_node.touch()
-        for node in device.nodes:
-            (folder / f"{device.path}:1.0" / node).mkdir(parents=True)
-            (dev / Path(node).name).touch()
+        return dev
 
 
 def look(tmp_path: Path, *devices: EmulatedDevice, frame_rate: float = 30.0) -> list[Device]:
-    """Find the devices on a bus of their own, with the sysfs that belongs to it."""
-    write_trees(tmp_path, tmp_path / "dev", devices)
+    """Find the devices on a bus of their own, with the nodes and the sysfs that belong to it."""
+    dev = tmp_path / "dev"
+    for device in devices:
+        path = f"{device.bus}-{'.'.join(map(str, device.port_numbers))}"
+        (folder := tmp_path / "bus" / "usb" / "devices" / path).mkdir(parents=True)
+        if device.serial:
+            (folder / "serial").write_text(f"{device.serial}\n", encoding="utf-8")
+        usb_node = dev / f"bus/usb/{device.bus:03d}" / f"{device.address:03d}"
+        usb_node.parent.mkdir(parents=True, exist_ok=True)
+        usb_node.touch()
+        for node in device.nodes:
+            (folder / f"{path}:1.0" / node).mkdir(parents=True)
+            (dev / Path(node).name).touch()
     backend = EmulatedBackend(*devices)
-    return inventory.find(backend, sysfs=tmp_path, dev=tmp_path / "dev", frame_rate=frame_rate)
+    return inventory.find(backend, sysfs=tmp_path, dev=dev, frame_rate=frame_rate)
 
 
 def test_whole_rig(tmp_path: Path) -> None:
@@ -139,7 +122,7 @@ def test_nothing_plugged_in(tmp_path: Path) -> None:
 def test_nodes_belong_to_their_camera(tmp_path: Path) -> None:
     """Each device has the nodes below its own USB device, in the order of their numbers."""
     nodes = ("video4linux/video10", "video4linux/video9", "tty/ttyACM7")
-    cameras = boson(1, nodes=nodes, ports=(1, 2)), boson(2, ports=(1, 3))
+    cameras = boson(1, nodes=nodes, port_numbers=(1, 2)), boson(2, port_numbers=(1, 3))
     first, second, controller = look(tmp_path, *cameras, apt())
     names = [[Path(node).name for node in device.nodes] for device in (first, second, controller)]
     assert names == [["video9", "video10", "ttyACM7"], ["video2", "video3", "ttyACM1"], ["ttyUSB0"]]
@@ -162,7 +145,7 @@ def test_rates_that_a_bus_cannot_carry(tmp_path: Path) -> None:
     (slow,) = look(tmp_path / "slow", boson(speed=2), frame_rate=60.0)
     rule = "It runs at full speed, and 60 frames/s take 314.6 Mbit/s. Must be at high speed"
     assert slow.warnings[0].startswith(rule)
-    pair = boson(1, ports=(1, 1)), boson(2, ports=(1, 2))
+    pair = boson(1, port_numbers=(1, 1)), boson(2, port_numbers=(1, 2))
     devices = look(tmp_path / "shared", *pair, frame_rate=60.0)
     assert " and ".join(devices[0].warnings) == (
         "It shares bus 1 with 1-1.2: 629.1 Mbit/s at 60 frames/s, of 426.0 Mbit/s at most. "

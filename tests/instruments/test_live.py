@@ -31,16 +31,14 @@ def frame(
     return Frame(counts, 0.0, 0.0, 0, flags, metadata=metadata)
 
 
-def preview(at: float = 0.0, shown: Frame | None = None, **readings: float) -> Preview:
-    """Preview of a recording of 60 frames/s in one band at a time [s]."""
+def preview(
+    at: float = 0.0, shown: Frame | None = None, *, ffc: float | None = None, **readings: float
+) -> Preview:
+    """Preview of a recording of 60 frames/s in one band at a time [s], maybe with its FFC state."""
     last = replace(shown or frame(), host_time=1000 + round(60 * at) / 60)
     totals = {"9.5": {"frames": round(60 * at) + 1, "lost": 2, "refused": 3, "damaged": 4}}
-    return Preview(at, {"9.5": last}, totals, readings)
-
-
-def ffc(at: float = 0.0, shown: Frame | None = None, *, ffc: float, fpa: float = 308.15) -> Preview:
-    """A preview with the camera's own readings."""
-    return replace(preview(at, shown), readings={"ffc 9.5": ffc, "fpa 9.5": fpa})
+    state = {} if ffc is None else {"ffc 9.5": ffc}
+    return Preview(at, {"9.5": last}, totals, {**readings, **state})
 
 
 def status(*previews: Preview) -> live.Status:
@@ -103,12 +101,12 @@ STATES = ("none performed", "imminent", "in progress", "complete")
 @pytest.mark.parametrize(
     ("sample", "state"),
     [
-        *((ffc(ffc=float(number)), name) for number, name in enumerate(STATES)),
-        (ffc(ffc=math.nan), "no answer"),
-        (ffc(ffc=7.0), "state 7"),
+        *((preview(ffc=float(number)), name) for number, name in enumerate(STATES)),
+        (preview(ffc=math.nan), "no answer"),
+        (preview(ffc=7.0), "state 7"),
         # A closed shutter is a correction, though the camera's answer is older or late.
         (preview(shown=CLOSED), "in progress"),
-        (ffc(shown=CLOSED, ffc=3.0), "in progress"),
+        (preview(shown=CLOSED, ffc=3.0), "in progress"),
         (preview(), "unknown"),
     ],
 )
@@ -120,7 +118,7 @@ def test_state_of_the_correction(sample: Preview, state: str) -> None:
 
 def test_time_since_the_last_correction() -> None:
     """The time counts from the last correction in the readings or in the telemetry."""
-    replies = (ffc(1.0, ffc=3.0), ffc(2.0, ffc=2.0), ffc(5.5, ffc=3.0))
+    replies = [preview(at, ffc=state) for at, state in ((1.0, 3.0), (2.0, 2.0), (5.5, 3.0))]
     assert math.isnan(status(replies[0]).ffc_age)
     assert status(*replies).ffc_age == 3.5
     report = [
@@ -133,10 +131,10 @@ def test_time_since_the_last_correction() -> None:
 
 def test_camera_temperature() -> None:
     """The reading counts, without an answer the telemetry, but not that of a damaged frame."""
-    report = frame(metadata=Metadata(fpa_temperature=311.2))
-    assert status(ffc(shown=report, ffc=3.0, fpa=308.15)).fpa_temperature == 308.15
-    silent = status(ffc(shown=report, ffc=3.0, fpa=math.nan))
-    np.testing.assert_allclose(silent.fpa_temperature, 311.2, rtol=0, atol=1e-9)
+    report = preview(shown=frame(metadata=Metadata(fpa_temperature=311.2)))
+    for reading, temperature in ((308.15, 308.15), (math.nan, 311.2)):
+        result = status(replace(report, readings={"fpa 9.5": reading}))
+        np.testing.assert_allclose(result.fpa_temperature, temperature, rtol=0, atol=1e-9)
     damaged = frame(flags=FrameFlag.WRONG_SIZE)
     assert math.isnan(status(preview(shown=damaged)).fpa_temperature)
 
@@ -197,12 +195,13 @@ def test_updates_keep_the_period() -> None:
     assert shown == [0.0, 1.0, 2.1, 0.3]
     view(replace(preview(0.1), frames={}))
     view(preview(0.2))
-    assert "2 lost" in repr(display.update.call_args[0][0])
+    assert "2 lost" in display.update.call_args[0][0]["text/plain"]
     assert display.update.call_count == 4
-    picture = display.display.call_args[0][0]
-    assert picture._repr_png_().startswith(b"\x89PNG\r\n")
-    assert repr(picture).startswith("pot (emulated), 0.0 s\n9.5: - frames/s, 2 lost")
-    assert repr(picture).endswith(f"plate 30.0 {DEGREE}")
+    assert display.update.call_args.kwargs == {"raw": True}
+    formats = display.display.call_args[0][0]
+    assert formats["image/png"].startswith(b"\x89PNG\r\n")
+    assert formats["text/plain"].startswith("pot (emulated), 0.0 s\n9.5: - frames/s, 2 lost")
+    assert formats["text/plain"].endswith(f"plate 30.0 {DEGREE}")
 
 
 def test_labels_and_room() -> None:
@@ -238,10 +237,8 @@ def test_a_separation_is_shown_beside_the_frames() -> None:
     separation = live.Separation(stream, correction)
     view = live.View(is_simulated=True, separation=separation)
     for number, at in enumerate(capture["time"].values):
-        frames = {
-            str(band): replace(frame(raw.sel(band=band).values[number]), host_time=100.0 + at)
-            for band in rig.bands
-        }
+        images = {str(band): frame(raw.sel(band=band).values[number]) for band in rig.bands}
+        frames = {band: replace(image, host_time=100.0 + at) for band, image in images.items()}
         totals = {"frames": number, "lost": 0, "refused": 0, "damaged": 0}
         shown = Preview(float(at), frames, dict.fromkeys(frames, totals), {})
         view(shown)

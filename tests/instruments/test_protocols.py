@@ -9,24 +9,12 @@ import numpy as np
 import pytest
 import xarray as xr
 from faulty_camera import Faults, FaultyCamera
-from rig_session import (
-    LEVELS,
-    QUICK,
-    SHAPE,
-    TEXT,
-    bench,
-    from_yaml,
-    pictures,
-    replaced,
-    rig,
-    scene_text,
-)
+from rig_session import LEVELS, QUICK, SHAPE, bench, from_yaml, pictures, replaced, rig, scene_text
 
 from dbthermal import store
 from dbthermal.instruments import protocols, recording
 from dbthermal.instruments.camera import SourceLostError
 from dbthermal.instruments.devices import Devices
-from dbthermal.instruments.emulated import World
 from dbthermal.instruments.recording import Preview, Summary, notes, open_capture
 from dbthermal.instruments.transport import EmulatedClock
 
@@ -35,15 +23,9 @@ ONE = replaced(("[300.0, 290.0, 310.0]", "[300.0]"), QUICKLY)
 TWO = replaced(("[300.0, 290.0, 310.0]", "[300.0, 290.0], accuracy: 0.05"), QUICKLY)
 
 
-def world_of(devices: Devices) -> World:
-    """World of emulated devices."""
-    assert isinstance(devices.world, World)
-    return devices.world
-
-
 def faulty(devices: Devices, band: str, faults: Faults) -> Devices:
     """The devices with a camera that has faults."""
-    world, form = world_of(devices), (None, SHAPE, 100.0, 2)
+    world, form = devices.world, (None, SHAPE, 100.0, 2)
     camera = FaultyCamera(world, band, pictures(world), *form, faults=faults)
     return replace(devices, sources={**devices.sources, band: camera})
 
@@ -55,11 +37,11 @@ def swept(
     preview: Callable[[Preview], None] | None = None,
 ) -> list[Summary]:
     """Sweep a blackbody that is at once where it is set."""
+    temperatures = [] if log is None else log
 
     def set_temperature(value: float) -> None:
-        world_of(devices).blackbody_temperature = value
-        if log is not None:
-            log.append(value)
+        devices.world.blackbody_temperature = value
+        temperatures.append(value)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(protocols, "STABILITY_PERIOD", 0.01)
@@ -160,7 +142,7 @@ def test_interrupted_sweep_goes_on(tmp_path: Path) -> None:
         assert steps[0].totals["8-14"]["frames"] > 8
         assert swept(devices, tmp_path, log) == steps
         # Offsets are corrected before the sweep, and at each temperature that is recorded.
-        assert {camera.ffc_count for camera in world_of(devices).cameras.values()} == {4}
+        assert {camera.ffc_count for camera in devices.world.cameras.values()} == {4}
     new_plan = from_yaml(replaced(("[300.0, 290.0, 310.0]", "[301.0, 290.0]")))
     with rig(new_plan) as devices, pytest.raises(ValueError, match=r"Must be of 301\.0 K"):
         swept(devices, tmp_path)
@@ -179,7 +161,7 @@ def test_a_step_must_be_of_one_state(tmp_path: Path) -> None:
 
         def drift(_: Preview) -> None:
             if (tmp_path / "plate_00_11.zarr").exists():
-                world_of(devices).blackbody_temperature = 300.5
+                devices.world.blackbody_temperature = 300.5
 
         swept(devices, tmp_path, preview=drift)
         with pytest.raises(ValueError, match=r"Invalid readings \[300.*\] K of 'blackbody'"):
@@ -191,12 +173,11 @@ def test_a_step_must_be_of_one_state(tmp_path: Path) -> None:
 
 def test_blackbody_must_be_read(tmp_path: Path) -> None:
     """A sweep without a reading of the blackbody raises an error before it begins."""
-    with pytest.raises(ValueError, match="Must have one named 'blackbody'"):
-        from_yaml(replaced(("{1: blackbody, 4: plate}", "{4: plate}")))
-    with rig(from_yaml(TEXT)) as devices:
-        silent = replace(devices, thermocouples=None)
-        with pytest.raises(ValueError, match="Must have and read a blackbody"):
-            swept(silent, tmp_path)
+    with (
+        rig(from_yaml()) as devices,
+        pytest.raises(ValueError, match="Must have and read a blackbody"),
+    ):
+        swept(replace(devices, thermocouples=None), tmp_path)
 
 
 def test_sweep_without_a_wheel(tmp_path: Path) -> None:
@@ -235,7 +216,7 @@ def test_scene_begins_with_its_recording(tmp_path: Path) -> None:
 def wait_for_rest(read: Callable[[float], float]) -> tuple[float, float]:
     """Mean that is found where 300 K are waited for, by a reading of the time, and the time."""
     clock = EmulatedClock()
-    result = protocols.wait_stable(from_yaml(TEXT), 300.0, lambda: read(clock()), clock=clock)
+    result = protocols.wait_stable(from_yaml(), 300.0, lambda: read(clock()), clock=clock)
     return result, clock()
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import NoReturn
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ from dbthermal.instruments.camera import Counts, Frame, FrameFlag, FrameSource
 from dbthermal.instruments.emulated import World
 from dbthermal.instruments.recording import Limits, Preview, Reading, notes, open_capture, record
 from dbthermal.instruments.session import Camera, Session
-from dbthermal.instruments.transport import EmulatedClock
+from dbthermal.instruments.transport import Clock, EmulatedClock
 
 SHAPE, RATE, CHUNK = (16, 24), 100.0, 5
 SMALL = Limits(chunk=CHUNK, reserve=0, silence=0.1, reading_period=0.05, preview_period=0.0)
@@ -40,16 +40,10 @@ def session(duration: float = 0.3) -> Session:
     return two_bands(duration, SHAPE, RATE)
 
 
-def bench(
-    first: Faults | None = None,
-    second: Faults | None = None,
-    *,
-    rows: int = 0,
-    world: World | None = None,
-) -> dict[str, FrameSource]:
+def bench(*faults: Faults, rows: int = 0, world: World | None = None) -> dict[str, FrameSource]:
     """Two cameras on one bench, with their faults."""
-    faults = dict(zip(BANDS, (first or Faults(), second or Faults()), strict=True))
-    return dict(two_cameras(picture, SHAPE, RATE, rows, faults=faults, world=world))
+    by_band = dict(zip(BANDS, faults, strict=bool(faults)))
+    return dict(two_cameras(picture, SHAPE, RATE, rows, faults=by_band, world=world))
 
 
 def written(path: Path) -> int:
@@ -148,41 +142,27 @@ def test_last_source_lost_ends_it(tmp_path: Path) -> None:
         open_capture(tmp_path / "b.zarr")
 
 
-def test_readings_come_beside_the_frames(tmp_path: Path) -> None:
-    """Readings are noted with their time; a failure is NaN, and the recording goes on."""
-    answers = iter([300.0, 301.0])
-
-    def read() -> float:
-        if (value := next(answers, None)) is None:
-            raise TimeoutError("No answer.")
-        return value
-
-    readings = {"plate": Reading(read)}
-    record(session(), bench(), tmp_path / "a.zarr", readings=readings, limits=SMALL)
-    entries = [note[1:] for note in notes(tmp_path / "a.zarr")]
-    assert entries[:2] == [("reading", "plate", 300.0), ("reading", "plate", 301.0)]
-    assert {kind for kind, _, _ in entries[2:]} == {"reading_failed"}
-
-
-def test_errors_end_it_and_keep_what_came(tmp_path: Path) -> None:
-    """An error in a reading or a preview is raised after the frames are stored."""
-    sources = bench()
+def test_errors_end_it_and_keep_what_came(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An error in a reading, a preview or a camera's thread is raised after frames are stored."""
+    sources, names = bench(), [tmp_path / f"{name}.zarr" for name in "abc"]
 
     def wrong() -> float:
         sources["9.5"].clock.sleep(0.1)
         raise KeyError("plate")
 
-    def show(_: Preview) -> NoReturn:
-        raise ZeroDivisionError
-
     with pytest.raises(KeyError, match="plate"):
-        record(session(9.0), sources, tmp_path / "a.zarr", readings={"a": Reading(wrong)})
+        record(session(9.0), sources, names[0], readings={"a": Reading(wrong)}, limits=SMALL)
+    fail = Mock(side_effect=ZeroDivisionError)
     with pytest.raises(ZeroDivisionError):
-        record(session(9.0), bench(), tmp_path / "b.zarr", limits=SMALL, preview=show)
-    for name, ended in (("a.zarr", "error"), ("b.zarr", "interrupted")):
-        opened = store.open_dataset(tmp_path / name)
+        record(session(9.0), bench(), names[1], limits=SMALL, preview=fail)
+    monkeypatch.setattr(FaultyCamera, "read", Mock(side_effect=SystemExit("left")))
+    with pytest.raises(SystemExit, match="left"):
+        record(session(9.0), bench(), names[2], limits=SMALL)
+    cases = zip(names, ("error", "interrupted", "error"), (1, 1, 0), strict=True)
+    for path, ended, frames in cases:
+        opened = store.open_dataset(path)
         assert (opened.attrs["complete"], opened.attrs["ended"]) == (False, ended)
-        assert opened.sizes["time"] >= 1
+        assert opened.sizes["time"] >= frames
 
 
 def test_what_is_refused(tmp_path: Path) -> None:
@@ -248,9 +228,7 @@ def interrupt(_: Preview | None = None) -> None:
 class HastyClock(EmulatedClock):
     """Emulated time in which no camera waits for the disk."""
 
-    def has_room(self, room: threading.Semaphore) -> bool:
-        """Take a place in a buffer; False if it is full."""
-        return room.acquire(blocking=False)
+    has_room = Clock.has_room
 
 
 def slow_disk(monkeypatch: pytest.MonkeyPatch, world: World) -> None:
@@ -326,7 +304,8 @@ def test_keyboard_interrupt_keeps_everything(
 
 def test_a_camera_that_gives_nothing_is_told(tmp_path: Path) -> None:
     """A camera without a frame makes the recording incomplete, and its silence is in the log."""
-    sources, path = bench(None, Faults(mute=True)), tmp_path / "a.zarr"
+    sources, path = bench(world=(world := World())), tmp_path / "a.zarr"
+    world.camera("9.5").phase = 1e9  # its first frame is far off
     summary = record(session(), sources, path, limits=SMALL)
     assert (summary.ended, summary.totals["9.5"]["frames"]) == ("no frames", 0)
     assert store.open_dataset(path).attrs["complete"] is False
@@ -367,15 +346,3 @@ def test_second_interrupt_stops_no_writing(tmp_path: Path, monkeypatch: pytest.M
     (writer,) = (thread for thread in threading.enumerate() if thread.name == "writer")
     writer.join(LIMIT)
     assert store.open_dataset(path).attrs["ended"] == "interrupted"
-
-
-def test_a_thread_that_exits_ends_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A SystemExit in a camera's thread ends the recording with the state "error"."""
-
-    def leave(*_: object) -> Frame:
-        raise SystemExit("left")
-
-    monkeypatch.setattr(FaultyCamera, "read", leave)
-    with pytest.raises(SystemExit, match="left"):
-        record(session(9.0), bench(), tmp_path / "a.zarr", limits=SMALL)
-    assert store.open_dataset(tmp_path / "a.zarr").attrs["ended"] == "error"

@@ -24,7 +24,6 @@ ONE = replaced(
     ("window: 3", "window: 0.1"),
     ("0.15", "0.6"),  # a reading takes a third of it
 )
-REAL = TEXT.replace("simulated: true", "simulated: false").replace("/dev/", "/dev/none/")
 
 
 @pytest.fixture(autouse=True)
@@ -96,28 +95,16 @@ def test_what_is_made_of_a_recording_is_none(tmp_path: Path) -> None:
         open_capture(folder / "aligned.zarr")
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("name: plate", "Missing 'simulated'. Must be set"),
-        (TEXT.replace("tc08:", "tc09:"), "Invalid address 'tc09:'. Must be tc08:"),
-        (TEXT.replace("v4l2:///dev/video0", "v4l2:///tmp/x"), "Must be v4l2:///dev/<node>"),
-        (REAL, "/dev/none/"),
-    ],
-)
-def test_failures_have_a_status(
-    text: str,
-    message: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+def test_a_missing_device_has_a_status(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A failure prints its message, after the report of the bus, with the documented status."""
+    """It is named with the documented status, after the report of the bus."""
     monkeypatch.setattr(inventory, "find", lambda **_: [])
-    assert run(tmp_path, text) == 1
+    real = TEXT.replace("simulated: true", "simulated: false").replace("/dev/", "/dev/none/")
+    assert run(tmp_path, real) == 1
     said = capsys.readouterr()
-    assert message in said.err
-    assert (inventory.describe([]) in said.out) is (text is REAL)
+    assert "/dev/none/" in said.err
+    assert inventory.describe([]) in said.out
 
 
 def test_what_is_refused_at_once(
@@ -155,7 +142,7 @@ def test_interrupted(
 
 def test_blackbody_is_set_by_the_user(monkeypatch: pytest.MonkeyPatch) -> None:
     """The user gets degrees Celsius; without a keyboard, the error says where to run it."""
-    questions, devices = list[str](), Devices(from_yaml(TEXT), {})
+    questions, devices = list[str](), Devices(from_yaml(), {})
     monkeypatch.setattr("builtins.input", questions.append)
     command._set_blackbody(devices, 300.0)
     text = "\nplate: set the blackbody to 26.85 degC and press Enter; then its rest is awaited. "
@@ -175,7 +162,7 @@ def test_bus_need_not_be_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
         raise inventory.LibusbMissingError("no libusb")
 
     monkeypatch.setattr(inventory, "find", missing)
-    emulated = from_yaml(TEXT)
+    emulated = from_yaml()
     real = replace(emulated, simulated=False)
     assert inventory.plugged_in(real) == "The USB bus was not looked at: no libusb"
     assert "is emulated: the USB bus was not" in inventory.plugged_in(emulated)

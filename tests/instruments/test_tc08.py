@@ -75,14 +75,15 @@ def test_channels_that_are_set_later_are_read(rig: LoggerBench) -> None:
 
 def test_firmware_download_is_waited_for(rig: LoggerBench) -> None:
     """Opening takes as long as the firmware's download, if that ends and a unit is there."""
-    rig.unit.faults.firmware_delay = 6.0
-    with pytest.raises(TimeoutError, match=r"not open after 5.0 s, at 0 %"):
-        rig.driver.open(timeout=5.0)
-    start = rig.clock.now
-    rig.driver.open()
-    assert rig.clock.now - start == pytest.approx(6.0, abs=0.051)
+    start, opened = rig.clock(), rig.unit.usb_tc08_open_unit_progress
+    with patch.object(rig.unit, "usb_tc08_open_unit_progress") as progress:
+        progress.side_effect = lambda *args: opened(*args) if rig.clock() >= start + 6.0 else 0
+        with pytest.raises(TimeoutError, match=r"not open after 5.0 s, at 0 %"):
+            rig.driver.open(timeout=5.0)
+        rig.driver.open()
+    assert rig.clock() - start == pytest.approx(6.0, abs=0.051)
     rig.driver.close()
-    rig.unit.faults.no_unit = True
+    rig.unit.is_open = True  # by another program
     with pytest.raises(ConnectionError, match=r"No TC-08\. Must be plugged in, and free"):
         rig.driver.open()
 
@@ -100,7 +101,7 @@ def test_each_error_is_explained(rig: LoggerBench) -> None:
     rig.ready()
     assert len(tc08.ERRORS) == len(MEANINGS) == 17
     for code in range(1, 17):
-        rig.unit.faults.errors["usb_tc08_get_single"] = code
+        rig.fail(code, "get_single")
         with pytest.raises(TC08Error, match=f"single reading: error {code}, .*{MEANINGS[code]}"):
             rig.driver.single()
 
@@ -108,7 +109,7 @@ def test_each_error_is_explained(rig: LoggerBench) -> None:
 @pytest.mark.parametrize("function", ["open_unit_async", "open_unit_progress", "set_channel"])
 def test_each_failing_step_of_opening_is_seen(rig: LoggerBench, function: str) -> None:
     """A step that fails is an error, and leaves no channel half set."""
-    rig.unit.faults.errors[f"usb_tc08_{function}"] = 9
+    rig.fail(9, function)
     with pytest.raises(TC08Error, match="EEPROM"):
         rig.ready()
     with pytest.raises(RuntimeError):
@@ -118,7 +119,7 @@ def test_each_failing_step_of_opening_is_seen(rig: LoggerBench, function: str) -
 def test_unplugging(rig: LoggerBench) -> None:
     """An unplugged unit raises an error at the next reading, noting that closing fails too."""
     rig.ready()
-    rig.unit.faults.unplugged = True
+    rig.fail(16, "get_single", "close_unit")
     with (
         pytest.raises(TC08Error, match="communication with the unit is lost") as caught,
         rig.driver,

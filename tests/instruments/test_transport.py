@@ -9,6 +9,8 @@ import subprocess
 import sys
 import tty
 from collections.abc import Iterator
+from typing import NamedTuple
+from unittest.mock import Mock, PropertyMock
 
 import pytest
 import serial
@@ -21,26 +23,25 @@ from dbthermal.instruments.transport import SerialTransport, TransportError, ope
 AWKWARD = bytes.fromhex("8E 0A 0D 11 13 00 FF AE 03 04 1A 7F")
 
 
-class Terminal:
-    """A raw pseudo-terminal: `far` is the device's end, `line` a transport at the driver's."""
+class Terminal(NamedTuple):
+    """A raw pseudo-terminal: its path, the device's end, and a line at the driver's."""
 
-    def __init__(self) -> None:
-        self.far, near = pty.openpty()
-        tty.setraw(near)
-        self.path = os.ttyname(near)
-        port = serial.Serial(self.path, exclusive=True, write_timeout=0.05)
-        self.line = SerialTransport(port, "serial:///dev/ttyACM0")
-        os.close(near)
+    path: str
+    far: int
+    line: SerialTransport
 
 
 @pytest.fixture
 def terminal() -> Iterator[Terminal]:
     """A pseudo-terminal with a line that is open."""
-    opened = Terminal()
-    yield opened
-    opened.line.close()
+    far, near = pty.openpty()
+    tty.setraw(near)
+    port = serial.Serial(path := os.ttyname(near), exclusive=True, write_timeout=0.05)
+    os.close(near)
+    yield Terminal(path, far, line := SerialTransport(port, "serial:///dev/ttyACM0"))
+    line.close()
     with contextlib.suppress(OSError):
-        os.close(opened.far)
+        os.close(far)
 
 
 def test_a_serial_line_changes_no_byte(terminal: Terminal) -> None:
@@ -102,20 +103,12 @@ test_a_wrong_name_is_refused = refused(
 )
 
 
-class Port:
-    """A serial port that fails with an error of input and output."""
-
-    def __setattr__(self, name: str, value: object) -> None:
-        raise OSError(errno.EIO, os.strerror(errno.EIO))
-
-    def close(self) -> None:
-        """Fail, too."""
-        raise OSError(errno.EIO, os.strerror(errno.EIO))
-
-
 def test_what_went_wrong_is_not_hidden_by_closing(monkeypatch: pytest.MonkeyPatch) -> None:
     """A failure to close is added as a note to the error that came before it."""
-    monkeypatch.setattr("serial.Serial", lambda *_, **__: Port())
+    failure = OSError(errno.EIO, os.strerror(errno.EIO))
+    port = Mock(**{"close.side_effect": failure})
+    type(port).rts = PropertyMock(side_effect=failure)
+    monkeypatch.setattr("serial.Serial", Mock(return_value=port))
     with pytest.raises(TransportError, match="Could not set RTS of 'serial://") as caught:
         open_serial("serial:///dev/ttyUSB0", baudrate=115200, rtscts=True)
     assert caught.value.__notes__[0].startswith("Closing failed too. Could not close 'serial://")

@@ -2,6 +2,7 @@
 
 import ctypes
 import errno
+import mmap
 import struct
 import sys
 from dataclasses import dataclass, field, replace
@@ -10,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from faulty_camera import frames
-from faulty_devices import Clock
+from faulty_devices import clock_at
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -28,16 +29,6 @@ BYTES = 2 * 6 * 6
 GOOD = 0x12000  # stamp of the monotonic clock, of the start of exposure
 
 
-class Memory(bytearray):
-    """Mapped memory that can be closed."""
-
-    closed = False
-
-    def close(self) -> None:
-        """Close as of `mmap.mmap`."""
-        self.closed = True
-
-
 @dataclass
 class Driver:
     """Stands in for the kernel: a node with a format, a rate and frames to give."""
@@ -48,9 +39,9 @@ class Driver:
     rate: int = 60
     answers: list[tuple[int, int, int, int]] = field(default_factory=list)
     calls: list[int] = field(default_factory=list)
-    maps: list[Memory] = field(default_factory=list)
+    maps: list[mmap.mmap] = field(default_factory=list)
     queued: list[int] = field(default_factory=list)
-    open_files: int = 0
+    files: set[int] = field(default_factory=set)  # that are open
     lost: int = 0
     lost_at: tuple[int, ...] = (v4l2.DQBUF, v4l2.STREAMOFF)
     signals: int = 0
@@ -59,24 +50,20 @@ class Driver:
         """Calls to this driver."""
         return v4l2.Kernel(
             open=self._open,
-            close=self._close,
+            close=self.files.remove,
             ioctl=self._ioctl,
             map=self._map,
             select=lambda *_: ([3], [], []) if self.answers or self.lost else ([], [], []),
-            clock=Clock(12.5),
+            clock=clock_at(12.5),
         )
 
     def _open(self, *_: object) -> int:
-        self.open_files += 1
+        self.files.add(3)
         return 3
 
-    def _close(self, file: int) -> None:
-        assert file == 3
-        self.open_files -= 1
-
-    def _map(self, file: int, length: int, offset: int) -> Memory:
+    def _map(self, file: int, length: int, offset: int) -> mmap.mmap:
         assert (file, offset) == (3, 4096 * len(self.maps))
-        self.maps.append(Memory(length))
+        self.maps.append(mmap.mmap(-1, length))
         return self.maps[-1]
 
     def _ioctl(self, file: int, number: int, argument: bytearray) -> int:
@@ -111,18 +98,13 @@ class Driver:
             case v4l2.QBUF:
                 self.queued.append(index)
             case v4l2.DQBUF:
-                self._dequeue(argument)
-
-    def _dequeue(self, argument: bytearray) -> None:
-        if self.answers[0][0] < 0:
-            self.answers.pop(0)
-            raise BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable")
-        used, flags, micros, sequence = self.answers.pop(0)
-        index = self.queued.pop(0)
-        self.maps[index][:] = np.arange(sequence, sequence + BYTES // 2, dtype="<u2").tobytes()
-        argument[:] = v4l2.BUFFER.pack(
-            index, 1, used, flags, 1, 7, micros, sequence, 1, 4096 * index, BYTES
-        )
+                used, flags, micros, number = self.answers.pop(0)
+                if used < 0:
+                    raise BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable")
+                index = self.queued.pop(0)
+                self.maps[index][:] = np.arange(number, number + BYTES // 2, dtype="<u2").tobytes()
+                values = index, 1, used, flags, 1, 7, micros, number, 1, 4096 * index, BYTES
+                argument[:] = v4l2.BUFFER.pack(*values)
 
 
 def opened(driver: Driver) -> v4l2.Capture:
@@ -240,7 +222,7 @@ def test_unplugging_is_told_and_close_still_works() -> None:
         capture.read()
     for _ in range(2):
         capture.close()
-    assert driver.open_files == 0
+    assert driver.files == set()
     assert all(memory.closed for memory in driver.maps)
     with pytest.raises(SourceLostError, match="it is closed"):
         capture.read()
@@ -258,7 +240,7 @@ def test_buffer_goes_back_whatever_happens(monkeypatch: pytest.MonkeyPatch) -> N
         driver.signals = 2
         assert capture.read().sequence == 1
         driver.signals = 1
-    assert driver.open_files == 0
+    assert driver.files == set()
 
 
 @pytest.mark.parametrize(
@@ -275,7 +257,7 @@ def test_other_streams_are_refused(driver: Driver, message: str) -> None:
     """A format or rate other than the requested one raises a ValueError, and the node is closed."""
     with pytest.raises(ValueError, match=message):
         opened(driver)
-    assert driver.open_files == 0
+    assert driver.files == set()
 
 
 def test_other_systems_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:

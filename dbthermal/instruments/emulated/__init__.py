@@ -108,9 +108,7 @@ class World:
     def thermocouple_temperature(self, channel: int) -> float:
         """Temperature of the tip of a thermocouple [K]; NaN if open, KeyError if in no scene."""
         place = self.thermocouples.get(channel, "open")
-        if place == "open":
-            return math.nan
-        temperatures = self.scene_temperatures()
+        temperatures = {**self.scene_temperatures(), "open": math.nan}
         label = f"Unknown place of thermocouple {channel}"
         texts.check_listed(label, place, sorted(temperatures), KeyError)
         return temperatures[place]

@@ -16,7 +16,7 @@ code. The conversion time is from datalogd's documentation, and likely, not cert
 import math
 import struct
 import threading
-from collections.abc import Callable, MutableSequence
+from collections.abc import MutableSequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, Final
@@ -25,12 +25,12 @@ from scipy.constants import zero_Celsius
 
 from dbthermal.instruments import _apt, boson
 from dbthermal.instruments._apt import Id
-from dbthermal.instruments.camera import FfcMode, FfcStatus
+from dbthermal.instruments.camera import FfcStatus
 from dbthermal.instruments.emulated import ROOM, World
 from dbthermal.instruments.filterwheel import BSC20X, StatusBits
 from dbthermal.instruments.session import WHEEL
 from dbthermal.instruments.tc08 import CHANNELS
-from dbthermal.instruments.transport import Clock, Closing, TransportError
+from dbthermal.instruments.transport import Closing, TransportError
 
 Numbers = MutableSequence[Any]  # a ctypes array of the caller, written in place
 
@@ -107,9 +107,9 @@ class EmulatedBoson(Line):
     def __init__(self, world: World, name: str) -> None:
         super().__init__(world)
         self.camera = world.camera(name)
-        # At power-on, by the identifier that sets them; not those of a real camera.
-        self.settings = {setting.set_command: 0 for setting in boson.SETTINGS}
-        self.settings[boson.FFC_MODE.set_command] = int(FfcMode.AUTO)
+        # At power-on, by the identifier that reads them; not those of a real camera.
+        self.settings = {setting.command: 0 for setting in boson.SETTINGS}
+        self.settings[boson.FFC_MODE.command] = int(boson.FfcMode.AUTO)
         self._name, self._decoder = name, boson.Decoder()
 
     @property
@@ -121,11 +121,7 @@ class EmulatedBoson(Line):
         """Take in bytes; frames of channels that have no commands are ignored."""
         for frame in self._decoder.feed(data):
             if frame.channel == boson.COMMAND_CHANNEL:
-                self.request(frame)
-
-    def request(self, frame: boson.Packet) -> None:
-        """Take in one request, and answer at once."""
-        self._replies.append(self.reply(frame))
+                self._replies.append(self.reply(frame))
 
     def reply(self, request: boson.Packet) -> bytes:
         """Bytes of the reply to a request, with status and data."""
@@ -133,15 +129,14 @@ class EmulatedBoson(Line):
         with self.world.lock:
             if not self.camera.has_frames:
                 self.camera.frame_count = math.floor(self.clock() * FRAME_RATE)
-            readings = self._readings()
-            sizes = {boson.RUN_FFC: 0, **dict.fromkeys(self.settings, 4)}
-            sizes |= dict.fromkeys(readings, 0)
-            if request.status != boson.REQUEST or len(data) != sizes.get(command):
+            readings, is_setting = self._readings(), command + 1 in self.settings
+            size = 4 if is_setting else 0 if command in {boson.RUN_FFC, *readings} else None
+            if request.status != boson.REQUEST or len(data) != size:
                 status = _REFUSED
             elif command == boson.RUN_FFC:
                 self.world.start_ffc(self._name)
-            elif command in self.settings:
-                (self.settings[command],) = struct.unpack(">i", data)
+            elif is_setting:
+                (self.settings[command + 1],) = struct.unpack(">i", data)
             else:
                 answer = readings[command]
         return boson.encode(replace(request, status=status, data=answer))
@@ -162,7 +157,7 @@ class EmulatedBoson(Line):
             boson.FFC_STATUS: (status,),
             boson.LAST_FFC_FRAME: (camera.last_ffc_frame,),
         }
-        values |= {key.reading: (self.settings[key.set_command],) for key in boson.SETTINGS}
+        values |= {setting: (self.settings[setting.command],) for setting in boson.SETTINGS}
         return {key.command: struct.pack(key.layout, *value) for key, value in values.items()}
 
 
@@ -178,25 +173,23 @@ class Drive:
     homing: bool
 
     @property
+    def ramp(self) -> float:
+        """Time of the first and of the last ramp [s], which meet in a short motion."""
+        meeting = math.sqrt(abs(self.distance) / self.acceleration)
+        return min(self.velocity / self.acceleration, meeting)
+
+    @property
     def duration(self) -> float:
         """Time that it takes [s]."""
-        way, velocity, acceleration = abs(self.distance), self.velocity, self.acceleration
-        if way < velocity**2 / acceleration:  # the ramps meet
-            return 2.0 * math.sqrt(way / acceleration)
-        return way / velocity + velocity / acceleration
+        way = abs(self.distance)
+        return self.ramp + way / (self.acceleration * self.ramp) if way else 0.0
 
     def place(self, time: float) -> float:
         """Place at a time [count]."""
         passed = min(time - self.start, self.duration)
-        remaining = self.duration - passed
-        way = min(self._rise(passed), abs(self.distance) / 2)
-        way += abs(self.distance) / 2 - min(self._rise(remaining), abs(self.distance) / 2)
+        first, last = min(passed, self.ramp), max(0.0, passed + self.ramp - self.duration)
+        way = self.acceleration * (self.ramp * (passed - first) + (first**2 - last**2) / 2)
         return self.origin + math.copysign(way, self.distance)
-
-    def _rise(self, time: float) -> float:
-        """Distance from rest in a time, with one ramp [count]."""
-        ramp = min(time, self.velocity / self.acceleration)
-        return self.acceleration * ramp**2 / 2 + self.velocity * (time - ramp)
 
 
 class EmulatedApt(Line):
@@ -270,14 +263,9 @@ class EmulatedApt(Line):
         acceleration = self._kept[Id.MOT_SET_VELPARAMS].acceleration / self.model.acceleration
         if self.enabled and speed >= SLOWEST and acceleration > 0:
             now = self.world.clock()
-            drive = Drive(now, self.position, distance, speed, acceleration, homing)
-            self._drive = self.plan(drive)
+            self._drive = Drive(now, self.position, distance, speed, acceleration, homing)
             self.homed &= not homing
             self._advance()
-
-    def plan(self, drive: Drive) -> Drive:
-        """Motion as it is carried out; replaced in tests."""
-        return drive
 
     def reply(self, identifier: Id, data: bytes = b"", value: int = 0, source: int = 0) -> None:
         """Send a message, of channel 1 without data; by default from the motor's address."""
@@ -316,9 +304,8 @@ class EmulatedTC08:
 
     is_simulated: Final = True
 
-    def __init__(self, temperature: Callable[[int], float], clock: Clock) -> None:
-        # Of the tip of a channel, 1 to 8 [K], NaN if it is open; and where a reading takes time.
-        self._temperature, self.clock = temperature, clock
+    def __init__(self, world: World) -> None:
+        self._world, self.clock = world, world.clock
         self.is_open, self.error = False, 0
         self._kinds: dict[int, str] = {}
 
@@ -368,7 +355,7 @@ class EmulatedTC08:
             return math.nan, False
         if channel == 0:
             return ROOM, False
-        tip = self._temperature(channel)
+        tip = self._world.thermocouple_temperature(channel)
         return (tip if RANGE[0] <= tip <= RANGE[1] else math.nan), False
 
 

@@ -281,10 +281,7 @@ def require_filter(path: str | Path, band: str | None) -> None:
 
 def is_complete(path: str | Path) -> bool:
     """True if a recording exists and went to its planned end."""
-    try:
-        return bool(store.open_dataset(path).attrs.get("complete", False))
-    except FileNotFoundError:
-        return False
+    return Path(path).exists() and bool(store.open_dataset(path).attrs.get("complete", False))
 
 
 def mean_reading(path: str | Path, source: str) -> float:

@@ -229,7 +229,6 @@ class _Run:
         self._work: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._room = {band: threading.Semaphore(limits.queue) for band in sources}
         self._lost_sources, self._written = list[str](), 0  # frames
-        self._refused_last: dict[str, int] = {}
         self._fetching = [
             Task(self.clock, band, self._guarded, partial(self._fetch, band, source))
             for band, source in sources.items()
@@ -272,7 +271,7 @@ class _Run:
             self._lost_sources.append(band)
             self._put_note(Note.SOURCE_LOST, band)
         finally:
-            self._refused_last[band] = refused
+            self._work.put(partial(self.file.refused, band, refused, self.clock()))
 
     def _read(self) -> None:
         """Read the instruments in turn, until the end."""
@@ -323,8 +322,6 @@ class _Run:
         """Write what is left in the queue, and close the file with the reason of the end."""
         while not self._work.empty():
             self._work.get_nowait()()
-        for band, number in self._refused_last.items():
-            self.file.refused(band, number, self.clock())
         if self.errors:
             is_full = getattr(self.errors[0], "errno", 0) == errno.ENOSPC
             self.ended = "no space" if is_full else "error"
