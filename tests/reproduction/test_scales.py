@@ -15,6 +15,7 @@ TIME = np.arange(FRAMES) / 10.0  # s
 RATIO = 2.0
 NOISE = np.array([0.004, 0.005])
 STILL = np.broadcast_to(np.arange(WIDTH) >= 30, (HEIGHT, WIDTH))
+WALL = xr.DataArray(STILL, dims=("y", "x"))  # pixels off the object
 
 
 def scene(rng: np.random.Generator, *, walkers: bool = False) -> tuple[Floats, Floats]:
@@ -47,17 +48,12 @@ def picture(scene: Floats, rng: np.random.Generator, *, between: bool = True) ->
     )
 
 
-def still() -> xr.DataArray:
-    """Pixels off the object."""
-    return xr.DataArray(STILL, dims=("y", "x"))
-
-
 @pytest.mark.parametrize("walkers", [False, True])
 def test_scale_is_undone(walkers: bool) -> None:
     """Each frame's gain is the true one within 2 %, with people before a third of the wall, too."""
     rng = np.random.default_rng(5)
     truth, _ = scene(rng, walkers=walkers)
-    undone = uncalibrated.unscaled(picture(truth, rng), still())
+    undone = uncalibrated.unscaled(picture(truth, rng), WALL)
     gain = 1 / np.ptp(truth, axis=(2, 3))
     gain /= gain.mean(axis=1, keepdims=True)
     error = undone["gain"].values / gain - 1
@@ -76,7 +72,7 @@ def test_reflection_of_a_scaled_picture() -> None:
     shown = picture(truth, rng)
     with pytest.raises(ValueError, match="pixels have a correlation below"):
         uncalibrated.uncalibrated_reflection(shown)  # for its scale moves all of them together
-    found = uncalibrated.uncalibrated_reflection(uncalibrated.unscaled(shown, still()))
+    found = uncalibrated.uncalibrated_reflection(uncalibrated.unscaled(shown, WALL))
     functions = polynomials(TIME, found.attrs["order"])
     both = found["reflection"].values, reflection
     rapid = [part[:, 20:, :30].reshape(FRAMES, -1) for part in both]
@@ -90,7 +86,7 @@ def test_constant_scale_is_left() -> None:
     """A scale that is the same in all frames explains nothing, and no value is changed."""
     rng = np.random.default_rng(7)
     shown = picture(scene(rng)[0], rng, between=False)
-    undone = uncalibrated.unscaled(shown, still())
+    undone = uncalibrated.unscaled(shown, WALL)
     assert undone.attrs["scale_undone"] == []
     assert max(undone.attrs["scale_explained"]) < 0.5
     np.testing.assert_array_equal(undone, shown)

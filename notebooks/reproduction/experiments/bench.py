@@ -113,19 +113,6 @@ def bench_series(
 
     The noise of the response is that of one pixel and frame: it stands for the drift of the camera
     between shutter events, which no mean over pixels removes. Common errors are drawn once.
-
-    Examples
-    --------
-    The emissivity of a chrome ball, 0.10, from a series with all errors of the bench:
-
-    >>> from dbthermal import calibration, simulation
-    >>> bench, ball = Bench(), OBJECTS[0]
-    >>> response, rng = simulation.Rig().response(), np.random.default_rng(1)
-    >>> series = bench_series(response, ball, bench, rng)
-    >>> stds = (bench.reading_std, bench.blackbody_std)  # K
-    >>> fitted = calibration.fit_emissivity(series, response, stds, bench.bias(ball))
-    >>> fitted["emissivity"].values.round(2).tolist()
-    [0.1, 0.1]
     """
     warm, cold = (
         grid.ravel()
@@ -150,19 +137,6 @@ def reflector_series(
     reflection all but the stray part is mirror-like, of a temperature higher by
     `Bench.mirrored_excess`. Parameters are those of `bench_series`. Raises a ValueError if no step
     of the object is `Bench.least_excess` above the air.
-
-    Examples
-    --------
-    A chrome ball of emissivity 0.10 seems to have 0.3, for it reflects what the foil does not:
-
-    >>> from dbthermal import calibration, simulation
-    >>> bench, ball = Bench(), OBJECTS[0]
-    >>> response, rng = simulation.Rig().response(), np.random.default_rng(1)
-    >>> series = reflector_series(response, ball, bench, rng)
-    >>> stds = (bench.reading_std, bench.foil_std)  # K
-    >>> fitted = calibration.reflector_emissivity(series, response, stds, bench.bias(ball))
-    >>> fitted["emissivity"].values.round(1).tolist()
-    [0.3, 0.3]
     """
     steps = np.array(bench.object_temperatures)
     warm = steps[steps >= bench.air_temperature + bench.least_excess]

@@ -82,9 +82,9 @@ def near_bound(
     solved = result["object_temperature"].notnull().all("time")
     response = rig.response()
     free = limits.bounds(truth, response, resting=False, emissivity_std=BEFOREHAND)
-    slope = limits.bounds(
-        truth, _as_line(response, rig), resting=False, response_kind="linear"
-    ).assign(object_temperature_std=np.nan * free["object_temperature_std"])
+    line = _as_line(response, rig)
+    slope = limits.bounds(truth, line, resting=False, response_kind="linear")
+    slope = slope.assign(object_temperature_std=np.nan * free["object_temperature_std"])
     names, kinds = [f"{it}_std" for it in _BOUNDED], (free, slope, limits.bounds(truth, response))
     bound = gridded([kind[names] for kind in kinds], {"knowing": KNOWING})
     second = (1.0 - truth["emissivity"]) / (1.0 - truth["emissivity"].isel(band=0))
@@ -96,9 +96,8 @@ def near_bound(
         "object_temperature_bound": (bound["object_temperature_std"] ** 2).mean("time") ** 0.5,
     }
     flat = {name: _row(values.where(solved), name) for name, values in measured.items()}
-    return xr.Dataset(flat | {"status": _row(result["status"], "status")}).assign_attrs(
-        origin="simulated", seed=seed
-    )
+    flat["status"] = _row(result["status"], "status")
+    return xr.Dataset(flat, attrs={"origin": "simulated", "seed": seed})
 
 
 def summary(measured: xr.Dataset) -> xr.Dataset:
@@ -109,18 +108,13 @@ def summary(measured: xr.Dataset) -> xr.Dataset:
     `scatter` (knowing) [1], standard deviation over the pixels of the ratio's error over its bound;
     `excess` (knowing) [1], the object's error over its bound.
     """
-    figures = {
-        name: _rms(measured[name])
-        for name in (f"{quantity}_{which}" for quantity in _BOUNDED for which in ("error", "bound"))
-    }
-    shares = {
-        "scatter": (measured["reflection_ratio_error"] / measured["reflection_ratio_bound"]).std(
-            "pixel"
-        ),
-        "excess": figures["object_temperature_error"] / figures["object_temperature_bound"],
-    }
-    shares = {name: values.assign_attrs(units="1") for name, values in shares.items()}
-    return xr.Dataset(figures | shares, attrs=measured.attrs)
+    names = [f"{quantity}_{which}" for quantity in _BOUNDED for which in ("error", "bound")]
+    figures = {name: _rms(measured[name]) for name in names}
+    ratio = measured["reflection_ratio_error"] / measured["reflection_ratio_bound"]
+    excess = figures["object_temperature_error"] / figures["object_temperature_bound"]
+    for name, values in {"scatter": ratio.std("pixel"), "excess": excess}.items():
+        figures[name] = values.assign_attrs(units="1")
+    return xr.Dataset(figures, attrs=measured.attrs)
 
 
 def pooled(
@@ -149,15 +143,15 @@ def pooled(
     rig, case = Rig(), {"emissivity": list(emissivity), "start": ends[0], "stop": ends[1]}
     time = np.arange(int(clock[0])) / clock[1]
     truth, capture, response = cases.simulate(case, rig, time, pixels, seed)
-    linear = _as_line(response, rig)
-    bound = limits.bounds(truth, linear, resting=False, response_kind="linear")
+    line = _as_line(response, rig)
+    bound = limits.bounds(truth, line, resting=False, response_kind="linear")
     single = _rms(_row(bound["reflection_ratio_std"].isel(band=1), "reflection_ratio"))
     ratio, errors = cases.reflection_ratio(list(emissivity)).item(), []
     for size in sizes:
         labels = xr.DataArray(np.arange(pixels)[np.newaxis] // size, dims=("y", "x"))
         result = separation.solve(capture, response, pool=None if size == 1 else labels)
-        errors.append(_of_groups(size, truth, result, ratio))
-        errors[-1]["reflection_ratio_bound"] = (single / np.sqrt(size)).assign_attrs(units="1")
+        bound = (single / np.sqrt(size)).assign_attrs(units="1")
+        errors.append(_of_groups(size, truth, result, ratio).assign(reflection_ratio_bound=bound))
     groups = gridded(errors, {"size": sizes})
     return groups.drop_vars("band", errors="ignore").assign_attrs(origin="simulated")
 
@@ -174,9 +168,8 @@ def _of_groups(size: int, truth: xr.Dataset, result: xr.Dataset, ratio: float) -
         for name, values in of_groups.items()
     }
     error = result["object_temperature"] - truth["object_temperature"]
-    measured["object_temperature_error"] = _rms(error.stack(pixel=error.dims)).assign_attrs(
-        units="K"
-    )
+    rms = _rms(error.stack(pixel=error.dims))
+    measured["object_temperature_error"] = rms.assign_attrs(units="K")
     return xr.Dataset(measured)
 
 

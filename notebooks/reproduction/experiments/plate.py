@@ -161,9 +161,7 @@ def scores(
     if scene.truth is None or calibrated is None:
         return {name: float(share) for name, share in shares.items()}
     # Errors of the object, and intervals by the noise alone.
-    noise, noise_of_whole = (
-        separation.without_calibration(result) for result in (per_pixel, whole)
-    )
+    noise, noise_of_whole = map(separation.without_calibration, (per_pixel, whole))
     error = (per_pixel[name] - scene.truth[name]).where(good)
     of_known = (calibrated[name] - scene.truth[name]).where(good)
     of_whole = value - scene.truth[name]

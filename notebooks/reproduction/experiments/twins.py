@@ -1,6 +1,7 @@
 """A simulated twin judged as the paper judges a scene: at its thermocouples."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -14,7 +15,8 @@ from reproduction import methods, twins
 from reproduction.experiments.bench import Bench, Sample, bench_series
 from reproduction.experiments.cases import held, rmse, scalars
 from reproduction.experiments.comparison import EVERY, MOVING, arguments
-from reproduction.twins.stage import Registration
+from reproduction.twins import stage
+from reproduction.twins.stage import Capture, Registration
 
 BEAD: Final = 3  # pixels along a side of the square that a thermocouple's bead covers
 
@@ -37,7 +39,7 @@ def judge_twin(
     variants: Mapping[str, Mapping[str, Any]],
     *,
     material: str,
-    capture: twins.Capture,
+    capture: Capture,
     registrations: Sequence[Registration] = ("perfect",),
     whole: bool = True,
     shown: bool = False,
@@ -45,7 +47,7 @@ def judge_twin(
     """Simulate a twin, calibrate its emissivity on the bench, and judge it at its thermocouple.
 
     One of `twins.TWINS`, of a material of `emissivity.embedded_table`, by two cameras a baseline
-    apart, whose views are registered in some ways (`twins.registered`), and by two at the first
+    apart, whose views are registered in some ways (`stage.registered`), and by two at the first
     one's place. Of the variants (see `at_thermocouple`), "calibrated" gets the emissivities that
     the bench finds for a piece of the same material, with their deviations.
 
@@ -67,8 +69,8 @@ def judge_twin(
     }
     views = {"one place": simulation.observe(scene, response, rng)}
     if capture.baseline:
-        apart = twins.observe(scene, response, rng)
-        views = {how: twins.registered(scene, apart, how) for how in registrations} | views
+        apart = stage.observe(scene, response, rng)
+        views = {how: stage.registered(scene, apart, how) for how in registrations} | views
     scores, picture = [], None
     for cameras, corrected in views.items():
         shift = alignment.reflection_shift(corrected, response) if cameras != "one place" else None
@@ -97,7 +99,7 @@ def judge_twin(
 
 def capture_of(
     material: str, shape: Sequence[int], clock: Sequence[float], baseline: float
-) -> twins.Capture:
+) -> Capture:
     """Capture of a twin of a material, in the bands of the default rig.
 
     Of rows and columns, a number of frames and their rate [Hz], by cameras a baseline apart [m].
@@ -105,10 +107,10 @@ def capture_of(
     table = emissivity.embedded_table()["emissivity"]
     true = table.sel(material=material, band=list(simulation.Rig().bands), drop=True)
     time = np.arange(int(clock[0])) / clock[1]
-    return twins.Capture(true, (shape[0], shape[1]), time, baseline)
+    return Capture(true, (shape[0], shape[1]), time, baseline)
 
 
-def separate_twin(name: str, seed: int, capture: twins.Capture, **options: Any) -> xr.Dataset:
+def separate_twin(name: str, seed: int, capture: Capture, **options: Any) -> xr.Dataset:
     """Separate a twin, seen by the default rig, by the default way; options of `twins.twin`.
 
     Returns the result of `separation.separate`, and in addition `apparent_temperature`
@@ -117,7 +119,7 @@ def separate_twin(name: str, seed: int, capture: twins.Capture, **options: Any) 
     """
     rng, response = np.random.default_rng(seed), simulation.Rig().response()
     scene = twins.twin(name, capture, rng, **options)
-    corrected = twins.registered(scene, twins.observe(scene, response, rng))
+    corrected = stage.registered(scene, stage.observe(scene, response, rng))
     shift = alignment.reflection_shift(corrected, response) if capture.baseline else None
     whole = separation.separate(corrected, response, reflection_shift=shift)
     return _with_truth(whole, scene, corrected, response)
@@ -184,7 +186,7 @@ def at_thermocouple(
     """Errors of several methods at the first thermocouple of a twin.
 
     The estimate is the mean over the pixels that the bead covers. The reading has the errors of a
-    probe that was compared with a reference (`twins.thermocouple_readings`), drawn anew for a
+    probe that was compared with a reference (`stage.thermocouple_readings`), drawn anew for a
     number of probes, so that the result does not depend on one probe's error. Variants are label ->
     `method` of `methods.METHODS` and arguments of `solve`, with the shift of the reflections
     where it takes one; the default method without arguments is what has been separated. A method
@@ -199,10 +201,8 @@ def at_thermocouple(
     reach = BEAD // 2
     centre = {dim: int(scene[f"thermocouple_{dim}"][0]) for dim in ("y", "x")}
     square = {dim: slice(place - reach, place + reach + 1) for dim, place in centre.items()}
-    readings = [
-        twins.thermocouple_readings(scene, rng, bead=BEAD).isel(thermocouple=0)
-        for _ in range(probes)
-    ]
+    read = partial(stage.thermocouple_readings, scene, rng, bead=BEAD)
+    readings = [read().isel(thermocouple=0) for _ in range(probes)]
     seed = int(rng.integers(2**32))  # of random starts: each capture has its own
     bead = separated["object_temperature"].isel(square).mean(("y", "x"), skipna=False)
     estimates = [
@@ -285,15 +285,6 @@ def relative_error_celsius(estimate: xr.DataArray, truth: xr.DataArray) -> xr.Da
     The zero of the Celsius scale is arbitrary, and so is this number; it is here to stand beside
     the published ones (Narayanan et al. 2026, doi:10.48550/arXiv.2509.11334) and is labelled. Both
     are temperatures [K] of the same coordinates.
-
-    Examples
-    --------
-    Half a kelvin at 25 degrees Celsius:
-
-    >>> import xarray as xr
-    >>> truth = xr.DataArray(298.15)
-    >>> round(float(relative_error_celsius(truth + 0.5, truth)), 6)  # [percent]
-    2.0
     """
     result = 100.0 * abs(estimate - truth) / (truth - zero_Celsius)
     label = "error relative to the true temperature in degrees Celsius"
@@ -311,21 +302,6 @@ def reflected_change(apparent: xr.DataArray, result: xr.Dataset) -> xr.DataArray
     change of the apparent temperature. That is of the inputs (band, time, y, x) [K], from
     `response.apparent_temperature`; the result from `solve`, `separate` or `complete`, of the same
     capture. ValueError if the first bands, sizes or coordinates differ.
-
-    Examples
-    --------
-    Plate glass, of reflectivity 0.14, reflects people who are 10 K warmer than the room:
-
-    >>> import numpy as np
-    >>> from dbthermal import response, separation, simulation
-    >>> rig, rng = simulation.Rig(), np.random.default_rng(1)
-    >>> glass = xr.DataArray([0.86, 0.72], coords={"band": list(rig.bands)}, dims="band")
-    >>> scene = simulation.walkers(np.arange(200) / 10, (4, 6), glass, rng)
-    >>> capture = simulation.observe(scene, rig.response(), rng)
-    >>> apparent = response.apparent_temperature(rig.response(), capture["counts"])
-    >>> change = reflected_change(apparent, separation.solve(capture, rig.response()))
-    >>> bool(1.2 < (change.max("time") - change.min("time")).median() < 1.8)  # 1.4 K and noise
-    True
     """
     if str(apparent["band"].values[0]) != str(result["band"].values[0]):
         raise ValueError(

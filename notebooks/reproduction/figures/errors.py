@@ -107,22 +107,17 @@ def validity(stress: xr.Dataset) -> Figure:
 def _bars(axis: Axes, flags: xr.DataArray, bad: xr.DataArray) -> None:
     """Stacked bars (case): right, wrong, and each flag; the wrong ones as a number, too."""
     first, wrong = first_reason(flags.transpose("case", "pixel")), bad.transpose("case", "pixel")
-    colors = {
-        "no flag and right": (_RIGHT, (first == "") & ~wrong.values),
-        "no flag and wrong (error above 4 standard deviations)": (
-            _WRONG,
-            (first == "") & wrong.values,
-        ),
-    }
+    colors = {"no flag and right": (_RIGHT, (first == "") & ~wrong.values)}
+    unseen = (_WRONG, (first == "") & wrong.values)
+    colors["no flag and wrong (error above 4 standard deviations)"] = unseen
     colors |= {words: (color, first == name) for name, (words, color) in REASONS.items()}
     place, reached = np.arange(flags.sizes["case"]), np.zeros(flags.sizes["case"])
     for label, (color, mask) in colors.items():
         share = 100 * mask.mean(axis=1)
         if share.any() or color in {_RIGHT, _WRONG}:
             axis.barh(place, share, 0.8, left=reached, color=color, label=label)
-        for row in (
-            np.flatnonzero(share).tolist() if color == _WRONG else ()
-        ):  # some are too small to see
+        # Some of the wrong ones are too small to see.
+        for row in np.flatnonzero(share).tolist() if color == _WRONG else ():
             text = f"{percent(share[row] / 100)} wrong"
             axis.text(101, row, text, color=_WRONG, fontsize=8, fontweight="bold", va="center")
         reached += share
@@ -141,9 +136,8 @@ def _dots(axis: Axes, coverage: dict[str, xr.DataArray]) -> None:
         axis.plot(np.full(low.size, _ARROW), low, "<", color=color, markersize=5)
     empty = np.all([share.isnull() for share in coverage.values()], axis=0)
     for row in np.flatnonzero(empty).tolist():
-        axis.text(
-            _SPAN[0] - 2, row, "none to judge", color="0.5", fontsize=8, va="center", ha="right"
-        )
+        text, end = "none to judge", _SPAN[0] - 2
+        axis.text(end, row, text, color="0.5", fontsize=8, va="center", ha="right")
     axis.set(xlim=(_LOWEST - 3, 100.5), xlabel="95 % intervals that hold the truth [%]")
     axis.set_title(f"arrow: below {_LOWEST:.0f} %", loc="left", fontsize=8, color="0.4")
     axis.grid(visible=True, axis="y", color="0.93")

@@ -84,15 +84,12 @@ AWAY: Final = (0.0, -0.5)
 WITHDRAWAL: Final = 1.0  # time in which it comes, and goes [s]
 
 
-def glass_plate(
-    capture: Capture, rng: np.random.Generator, *, writing: Writing | None = None
-) -> Stage:
+def glass_plate(capture: Capture, rng: np.random.Generator) -> Stage:
     """Plate heated by a hot-air gun, in which a board is reflected while somebody writes on it.
 
-    By default the letters CV with a cold, wet finger, begun at a random moment within 2 s.
+    The letters CV with a cold, wet finger, begun at a random moment within 2 s.
     """
-    pane, gun = Pane(), Gun()
-    writing = writing or Writing(start=float(rng.uniform(2.0, 4.0)))
+    pane, gun, writing = Pane(), Gun(), Writing(start=float(rng.uniform(2.0, 4.0)))
     mesh, start = pane.mesh(), gun.start - _BEFORE * gun.rise
     camera = Camera((0.24, -0.62, 0.0), (0.0, 0.0, 0.0), capture.shape)
     return Stage(
