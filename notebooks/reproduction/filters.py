@@ -78,14 +78,10 @@ def rank_filters(
     # Both criteria over the materials, sorted by the first.
     pairs = pair_summary(condition_numbers(table)).sel(first=beside, drop=True)
     pairs = pairs.rename(second="band").sel(band=std["band"])
-    result = xr.Dataset(
-        {
-            "condition_number": pairs["median"],
-            "condition_number_mean": pairs["mean"],
-            "object_temperature_std": std.assign_attrs(units="K", long_name="median of its std"),
-            "noise": noise.sel(band=std["band"]).assign_attrs(units="K"),
-        }
-    ).sortby("condition_number")
+    columns = {"condition_number": pairs["median"], "condition_number_mean": pairs["mean"]}
+    columns["object_temperature_std"] = std.assign_attrs(units="K", long_name="median of its std")
+    columns["noise"] = noise.sel(band=std["band"]).assign_attrs(units="K")
+    result = xr.Dataset(columns).sortby("condition_number")
     names = [str(name) for name in result["band"].values]
     return result.assign_attrs(
         beside=beside,

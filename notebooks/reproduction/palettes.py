@@ -243,13 +243,8 @@ def masked_palette_video(
     attrs = _attrs(path, palette, float(residual), video.colours[coloured], share)
     dims = tuple(video.coords)
     mask_attrs = {"units": "1", "long_name": "nearer to the palette than to gray"}
-    return xr.Dataset(
-        {
-            "value": (dims, position[video.index], attrs),
-            "valid": (dims, valid[video.index], mask_attrs),
-        },
-        video.coords,
-    )
+    mask = (dims, valid[video.index], mask_attrs)
+    return xr.Dataset({"value": (dims, position[video.index], attrs), "valid": mask}, video.coords)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ videos, and every row says of which. Rows that stand in no table of the paper ar
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -162,17 +162,11 @@ def _terms() -> Iterator[Row]:
 
 def _bench() -> Iterator[Row]:
     for procedure, name in (("paper", "bench"), ("reflector", "reflector")):
+        judged, within = ("distance", 0.01) if name == "bench" else ("value", 0.03)
         for thing, value in EMISSIVITIES[procedure].items():
-            yield Row(
-                "Table 2",
-                f"emissivity of the {thing}, {name}",
-                "07_bench",
-                (f"{thing}: {name} [1]",),
-                value,
-                judged="distance" if name == "bench" else "value",
-                within=0.01 if name == "bench" else 0.03,
-                reference=EMISSIVITIES["reference"][thing],
-            )
+            quantity, names = f"emissivity of the {thing}, {name}", (f"{thing}: {name} [1]",)
+            row = Row("Table 2", quantity, "07_bench", names, value, "1", judged, within)
+            yield replace(row, reference=EMISSIVITIES["reference"][thing])
 
 
 def _scenes() -> Iterator[Row]:

@@ -114,10 +114,8 @@ def bench_series(
     The noise of the response is that of one pixel and frame: it stands for the drift of the camera
     between shutter events, which no mean over pixels removes. Common errors are drawn once.
     """
-    warm, cold = (
-        grid.ravel()
-        for grid in np.meshgrid(bench.object_temperatures, bench.blackbody_temperatures)
-    )
+    grids = np.meshgrid(bench.object_temperatures, bench.blackbody_temperatures)
+    warm, cold = (grid.ravel() for grid in grids)
     counts = _counts(response, sample, bench, warm, cold, rng.uniform(0.0, sample.stray))
     shown = cold + rng.uniform(-1, 1) * bench.blackbody_tolerance
     read = {

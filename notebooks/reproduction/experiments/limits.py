@@ -249,19 +249,14 @@ def judge(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
     over the frames, and bad in `any` where that is so or the error of an emissivity exceeds four
     of its standard deviations. A pixel without a value is not bad.
 
-    Returns
-    -------
-    Dataset
-        Over all pixels, in [1] but for the error in [K]; NaN where there is nothing to count:
-
-        - `object_coverage` (among): share of samples whose 95 % interval holds the truth;
-          `emissivity_coverage` (among, band): share of pixels;
-        - `width` (band): stated standard deviation of the emissivity over the robust standard
-          deviation of its error, both of all pixels with a value; 1 for a calibrated uncertainty;
-        - `object_temperature_rmse` [K] and `emissivity_error` (band), see `cases.score`;
-        - `flagged`: share of pixels with any flag;
-        - `bad_pixels` (kind): their number; `bad_flagged` (kind): share of them with a flag;
-        - `status` (pixel), and `bad` (kind, pixel), true where bad.
+    Over all pixels, in [1] but for the error in [K], NaN where there is nothing to count:
+    `object_coverage` (among), share of samples whose 95 % interval holds the truth;
+    `emissivity_coverage` (among, band), share of pixels; `width` (band), stated standard deviation
+    of the emissivity over the robust standard deviation of its error, both of all pixels with a
+    value, 1 for a calibrated uncertainty; `object_temperature_rmse` [K] and `emissivity_error`
+    (band), see `cases.score`; `flagged`, share of pixels with any flag; `bad_pixels` (kind), their
+    number; `bad_flagged` (kind), share of them with a flag; `status` (pixel), and `bad` (kind,
+    pixel), true where bad.
     """
     statistics = _coverage(truth, result)
     # Pixels (kind, pixel) with an error beyond four standard deviations.
@@ -298,11 +293,10 @@ def _coverage(truth: xr.Dataset, result: xr.Dataset) -> dict[str, xr.DataArray]:
     label = xr.DataArray(list(AMONG), dims="among", coords={"among": list(AMONG)})
     chosen = (result["status"] == 0) | (label == "all")
     statistics = {}
-    for name, over in (("object", ("time", *_PIXELS)), ("emissivity", _PIXELS)):
-        full = "object_temperature" if name == "object" else name
-        error, std = abs(result[full] - truth[full]), result[f"{full}_std"]
-        counted = error.notnull() & chosen
-        statistics[f"{name}_coverage"] = _share(error < cases.INTERVAL * std, counted, over)
+    for name, over in {"object_temperature": ("time", *_PIXELS), "emissivity": _PIXELS}.items():
+        error, key = abs(result[name] - truth[name]), name.removesuffix("_temperature")
+        within = error < cases.INTERVAL * result[f"{name}_std"]
+        statistics[f"{key}_coverage"] = _share(within, error.notnull() & chosen, over)
     return statistics
 
 

@@ -130,10 +130,8 @@ def _with_truth(
 ) -> xr.Dataset:
     """Result with the inputs and the truth beside it, see `separate_twin`."""
     seen = responses.apparent_temperature(response, corrected["counts"])
-    films = {
-        f"true_{layer}_temperature": scene[f"{layer}_temperature"]
-        for layer in ("object", "background")
-    }
+    names = ("object_temperature", "background_temperature")
+    films = {f"true_{name}": scene[name] for name in names}
     films["apparent_temperature"] = seen.assign_attrs(scene.attrs)
     films = {name: film.astype("float32") for name, film in films.items()}
     return separated.assign(films).assign_attrs(corrected.attrs)

@@ -8,16 +8,8 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from dbthermal.figures import REASONS, first_reason
-from dbthermal.figures.drawing import (
-    COLORS,
-    band_label,
-    canvas,
-    marked_line,
-    percent,
-    plain_decades,
-    provenance_note,
-)
+from dbthermal.figures import REASONS, drawing, first_reason
+from dbthermal.figures.drawing import COLORS, band_label, canvas, marked_line
 
 _RIGHT, _WRONG = "#a8d5b0", "#e3000f"
 # What a 95 % interval should hold, where the axis of the coverage begins, and its arrow lies [%].
@@ -46,7 +38,7 @@ def accuracy(sweep: xr.Dataset) -> Figure:
     first.set_xlabel("median RMSE of the object temperature [K]")
     second.set_xlabel("median error of the emissivity [1]")
     second.set_yticklabels([])
-    figure.suptitle("Accuracy of the separation" + provenance_note(sweep))
+    figure.suptitle("Accuracy of the separation" + drawing.provenance_note(sweep))
     return figure
 
 
@@ -65,7 +57,7 @@ def error_bar_calibration(scores: Mapping[str, xr.DataArray]) -> Figure:
         axis.set(title=name.replace("_", " "), xlabel="error / standard deviation [1]")
     axes[0, 0].set_ylabel("density [1]")
     data = next(iter(scores.values()))
-    figure.suptitle("Error bars against errors" + provenance_note(data))
+    figure.suptitle("Error bars against errors" + drawing.provenance_note(data))
     return figure
 
 
@@ -100,7 +92,7 @@ def validity(stress: xr.Dataset) -> Figure:
     rows = max(-(-len(words[1]) // 2), len(dots[1]))
     figure.set_figheight(0.29 * place.size + 0.18 * rows + 1.7)
     figure.legend(*dots, loc="outside lower right", **style)
-    figure.suptitle("Which pixels can be trusted, and why not" + provenance_note(stress))
+    figure.suptitle("Which pixels can be trusted, and why not" + drawing.provenance_note(stress))
     return figure
 
 
@@ -118,7 +110,7 @@ def _bars(axis: Axes, flags: xr.DataArray, bad: xr.DataArray) -> None:
             axis.barh(place, share, 0.8, left=reached, color=color, label=label)
         # Some of the wrong ones are too small to see.
         for row in np.flatnonzero(share).tolist() if color == _WRONG else ():
-            text = f"{percent(share[row] / 100)} wrong"
+            text = f"{drawing.percent(share[row] / 100)} wrong"
             axis.text(101, row, text, color=_WRONG, fontsize=8, fontweight="bold", va="center")
         reached += share
     axis.set(xlim=(0, 100), xlabel="share of the pixels [%]")
@@ -164,7 +156,7 @@ def offsets(measured: xr.Dataset) -> Figure:
     third.set(ylabel="flagged [%]", ylim=(-3, 103))
     _over((first, second, third), "offset of the second band [frame]")
     second.legend(frameon=False, fontsize=8)
-    figure.suptitle("Bands exposed apart" + provenance_note(measured))
+    figure.suptitle("Bands exposed apart" + drawing.provenance_note(measured))
     return figure
 
 
@@ -187,7 +179,7 @@ def disturbances(measured: xr.Dataset) -> Figure:
     _kelvin(axis)
     axis.margins(y=0.2)
     axis.legend(frameon=False, fontsize=8)
-    axis.set_title("Lost frames and a closed shutter" + provenance_note(measured))
+    axis.set_title("Lost frames and a closed shutter" + drawing.provenance_note(measured))
     return figure
 
 
@@ -207,7 +199,7 @@ def parallax(measured: xr.Dataset) -> Figure:
     third.set(ylabel="95 % intervals that hold, no flag [%]", ylim=(-3, 103))
     _over((first, second, third), "parallax of the reflection [pixel]")
     first.legend(frameon=False, fontsize=8)
-    figure.suptitle("Two cameras side by side" + provenance_note(measured))
+    figure.suptitle("Two cameras side by side" + drawing.provenance_note(measured))
     return figure
 
 
@@ -229,4 +221,4 @@ def _over(axes: Iterable[Axes], label: str) -> None:
 def _kelvin(axis: Axes) -> None:
     """A logarithmic axis of errors, with plain numbers."""
     axis.set(yscale="log", ylabel=_RMSE_LABEL)
-    plain_decades(axis)
+    drawing.plain_decades(axis)
