@@ -41,12 +41,8 @@ def capture_of(counts: list[Floats], names: tuple[str, ...] = RIG.bands) -> xr.D
 
 def seen(warm: Floats, cold: Floats, emissivity: tuple[float, float]) -> xr.Dataset:
     """Capture of an object before a background, both (time, y, x) [K]."""
-    return capture_of(
-        [
-            mixing.leaving(e, curve.counts(warm), curve.counts(cold))
-            for e, curve in zip(emissivity, CURVES, strict=True)
-        ]
-    )
+    pairs = zip(emissivity, CURVES, strict=True)
+    return capture_of([mixing.leaving(e, it.counts(warm), it.counts(cold)) for e, it in pairs])
 
 
 def solve(capture: xr.Dataset, method: str, settings: Any = None, **options: Any) -> xr.Dataset:

@@ -64,14 +64,9 @@ def test_masked_palette_video(tmp_path: Path) -> None:
         palettes.masked_palette_video(gray)
 
 
-test_another_palette_is_refused = refused(
-    palettes.palette_video,
-    [
-        *((name, f"Palette '{name}' does not fit.*from 'plasma'") for name in ("turbo", "gray")),
-        *((name, f"Unknown palette '{name}'") for name in ("plasmatic", "tab10")),
-    ],
-    "plasma",
-)
+PALETTES = [(name, f"Palette '{name}' does not fit.*from 'plasma'") for name in ("turbo", "gray")]
+PALETTES += [(name, f"Unknown palette '{name}'") for name in ("plasmatic", "tab10")]
+test_another_palette_is_refused = refused(palettes.palette_video, PALETTES, "plasma")
 
 
 @pytest.mark.data

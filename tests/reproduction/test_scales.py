@@ -36,16 +36,18 @@ def scene(rng: np.random.Generator, *, walkers: bool = False) -> tuple[Floats, F
     return np.stack([object_part + reflection, object_part + RATIO * reflection]), reflection
 
 
+def labelled(values: Floats, **attrs: object) -> xr.DataArray:
+    """Two bands (band, time, y, x) with their coordinates."""
+    coords = {"band": ["8-14", "9.5"], "time": TIME}
+    return xr.DataArray(values, coords, ("band", "time", "y", "x"), attrs=attrs)
+
+
 def picture(scene: Floats, rng: np.random.Generator, *, between: bool = True) -> xr.DataArray:
     """Picture of 8 bit, between the extremes of each frame or of all, with noise of one step."""
     axes = (2, 3) if between else (1, 2, 3)
     low, high = (part(scene, axis=axes, keepdims=True) for part in (np.min, np.max))
     shown = (scene - low) / (high - low) + rng.normal(0, 1 / 255, scene.shape)
-    return xr.DataArray(
-        np.rint(255 * shown) / 255,
-        dims=("band", "time", "y", "x"),
-        coords={"band": ["8-14", "9.5"], "time": TIME},
-    )
+    return labelled(np.rint(255 * shown) / 255)
 
 
 @pytest.mark.parametrize("walkers", [False, True])
@@ -126,14 +128,8 @@ def movie(scaling: float = 0.0) -> xr.DataArray:
     for ratio, noise in zip((1.0, RATIO), NOISE, strict=True):
         clean = emission + ratio * pulses()
         gain, offset = scaling * rng.standard_normal((2, FRAMES, 1, 1))
-        noisy = (1 + gain) * clean + offset + noise * rng.standard_normal(clean.shape)
-        bands.append(noisy)
-    return xr.DataArray(
-        np.stack(bands),
-        dims=("band", "time", "y", "x"),
-        coords={"band": ["8-14", "9.5"], "time": TIME},
-        attrs={"units": "1", "radiometric": 0},
-    )
+        bands.append((1 + gain) * clean + offset + noise * rng.standard_normal(clean.shape))
+    return labelled(np.stack(bands), units="1", radiometric=0)
 
 
 @pytest.fixture(scope="module")
