@@ -194,8 +194,10 @@ def palette_video(
     H.264 carries no checksum: of 200 files with one flipped bit, a block of zeros or a cut, up to
     60 decode to other values without complaint. `sha256`, of 64 lower-case digits, excludes that.
 
-    The file, in MP4, MOV, Matroska, WebM or AVI, is of one video, and takes at most so much memory
-    [byte], about 9 a pixel and frame; the palette is a continuous colour map of matplotlib.
+    The file, in MP4, MOV, Matroska, WebM or AVI, is of one video that takes at most so much memory
+    [byte], about 9 a pixel and frame; a larger one is refused before it is taken. So are addresses
+    and playlists, and nothing that the file names is opened. The palette is a continuous colour map
+    of matplotlib.
 
     The result has positions (time, y, x), float32 in [0, 1]; time [s] since the first frame, from
     the stream's timestamps. Attributes: ``radiometric`` = 0, ``palette``, ``palette_residual`` (RMS

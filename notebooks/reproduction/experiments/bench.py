@@ -165,7 +165,7 @@ def _blackbody(response: xr.Dataset, temperature: Array) -> Array:
 def _counts(
     response: xr.Dataset, sample: Sample, bench: Bench, warm: Array, mirrored: Array, stray: float
 ) -> Array:
-    """Counts of a warm sample that mirrors temperatures, but of whose reflection some is stray."""
+    """Counts (band, measurement) of a warm mirror, of whose reflection a share is of the room."""
     room = _blackbody(response, np.full_like(warm, bench.air_temperature))
     reflected = (1.0 - stray) * _blackbody(response, mirrored) + stray * room
     share = band_emissivity(sample, _names(response)).values[:, np.newaxis]

@@ -89,9 +89,12 @@ def judge(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
     squared = (result["object_temperature"] - truth["object_temperature"]) ** 2
     of_emissivity = abs(result["emissivity"] - truth["emissivity"])
     rmse = squared.mean("time", skipna=False) ** 0.5
-    errors = {"object_temperature_rmse": rmse.assign_attrs(units="K")}
-    errors["emissivity_error"] = of_emissivity.assign_attrs(units="1")
-    flat = xr.Dataset(errors | {"status": result["status"]}).isel(y=0).rename(x="pixel")
+    errors = {
+        "object_temperature_rmse": rmse.assign_attrs(units="K"),
+        "emissivity_error": of_emissivity.assign_attrs(units="1"),
+        "status": result["status"],
+    }
+    flat = xr.Dataset(errors).isel(y=0).rename(x="pixel")
     return flat.drop_vars(["y", "pixel"], errors="ignore")
 
 

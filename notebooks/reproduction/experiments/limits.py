@@ -150,8 +150,8 @@ def pooled(
     for size in sizes:
         labels = xr.DataArray(np.arange(pixels)[np.newaxis] // size, dims=("y", "x"))
         result = separation.solve(capture, response, pool=None if size == 1 else labels)
-        bound = (single / np.sqrt(size)).assign_attrs(units="1")
-        errors.append(_of_groups(size, truth, result, ratio).assign(reflection_ratio_bound=bound))
+        lowest = (single / np.sqrt(size)).assign_attrs(units="1")
+        errors.append(_of_groups(size, truth, result, ratio).assign(reflection_ratio_bound=lowest))
     groups = gridded(errors, {"size": sizes})
     return groups.drop_vars("band", errors="ignore").assign_attrs(origin="simulated")
 

@@ -55,8 +55,9 @@ class Pixels:
         time = np.arange((count - 1) * steps + 1 + later) / (rate * steps)
         value = xr.DataArray(list(self.emissivity), dims="band", coords={"band": list(Rig().bands)})
         background, (start, stop) = Background(**self.background), self.ends
-        make = partial(simulation.independent_pixels, start=start, stop=stop)
-        return make(time, value, background, self.pixels, rng)
+        return simulation.independent_pixels(
+            time, value, background, self.pixels, rng, start=start, stop=stop
+        )
 
 
 def apart(delay: float, *, pixels: Mapping[str, Any], seed: int) -> xr.Dataset:

@@ -128,7 +128,7 @@ FINGERS: Final = (
     Finger((0.028, 0.030), (0.041, 0.085), 0.008),
 )
 """Thumb to little finger of a right hand, seen from its back; fingers point up."""
-_PALM, _RATE = 306.15, 0.8  # temperature of a hand [K], and how often its first finger bends [1/s]
+_WARMTH, _RATE = 306.15, 0.8  # temperature of a hand [K], bends of its first finger [1/s]
 _SOFTNESS: Final = 0.002  # width of the edge of a print [m]
 
 
@@ -139,7 +139,7 @@ def hand(motion: Motion, *, flex: float = 0.0) -> list[Actor]:
     at `_RATE`, each of the others a little more often.
     """
     bones = (ellipsoid(PALM, (0.0, 0.0, 0.0), _FINE), capsule(*FOREARM, _SPACING))
-    palm = painted([(bone, _PALM) for bone in bones], motion)
+    palm = painted([(bone, _WARMTH) for bone in bones], motion)
     return [palm, *(_finger(n, motion, flex) for n in range(len(FINGERS)))]
 
 
@@ -152,7 +152,7 @@ def _finger(number: int, motion: Motion, flex: float) -> Actor:
         phase = 2.0 * np.pi * _RATE * (1.0 + 0.13 * number) * time + number
         return motion(time) @ hinged(root, Rotation.from_euler("x", flex * np.sin(phase)))
 
-    return painted([(capsule(root, tip, finger.radius, _FINE), _PALM)], bent)
+    return painted([(capsule(root, tip, finger.radius, _FINE), _WARMTH)], bent)
 
 
 def imprint(places: npt.ArrayLike) -> Array:
@@ -179,7 +179,7 @@ _TOY, _MOTOR = 0.006, 315.15  # distance of the vertices [m], and temperature of
 
 
 def toy(motion: Motion, *, body: float = 303.15) -> Actor:
-    """Toy car, 0.16 m long, that runs along x on z = 0, of a temperature [K], its bonnet warm."""
+    """Toy car, 0.16 m long, that runs along x on z = 0: body at a temperature [K], warm bonnet."""
     frame = trimesh.creation.box((0.16, 0.07, 0.04)).apply_translation((0, 0, 0.035))
     cabin = trimesh.creation.box((0.08, 0.06, 0.04)).apply_translation((-0.02, 0, 0.07))
     bonnet = ellipsoid((0.03, 0.03, 0.012), (0.05, 0, 0.055), _TOY)
