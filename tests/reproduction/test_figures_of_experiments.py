@@ -111,7 +111,7 @@ def test_errors_are_in_units_of_their_bound() -> None:
     np.testing.assert_allclose(np.asarray(below.lines[0].get_ydata()), 1.2, rtol=1e-12)
 
 
-@pytest.mark.parametrize("name", [name for name in figures.__all__ if name != "separated_film"])
+@pytest.mark.parametrize("name", figures.__all__)
 def test_a_figure_names_the_kind_of_its_data(name: str) -> None:
     """Simulated data and pictures are called so in the title; that labels have units, see `Run`."""
     assert "provenance_note(" in inspect.getsource(getattr(figures, name))
