@@ -33,9 +33,9 @@ from dbthermal._coordinates import laid_on
 from dbthermal.scene import separate_capture
 from dbthermal.schema import Status
 from reproduction import figures as drawings
+from reproduction.experiments.twins import reflected_change
 from reproduction.filters import rank_filters
 from reproduction.methods.dbvt import DbvtSettings
-from reproduction.metrics import reflected_change
 
 RIG = simulation.Rig(bad_fraction=0.0)
 CAMERA = RIG.response()

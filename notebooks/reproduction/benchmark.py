@@ -95,23 +95,16 @@ def scene(cameras: str, shape: tuple[int, int], frames: int = FRAMES) -> xr.Data
     return truth.assign(counts=simulation.observe(truth, rig.response(), rng)["counts"])
 
 
-@lru_cache(maxsize=1)
-def _response() -> xr.Dataset:
-    """Response of the simulated rig, made once: it is not what is timed."""
-    return simulation.Rig().response()
-
-
 def separate(counts: xr.DataArray, workers: int = 1) -> xr.Dataset:
     """Separate by the default call."""
-    return separation.separate(counts.to_dataset(), _response(), workers=workers)
+    return separation.separate(counts.to_dataset(), response(), workers=workers)
 
 
 def solver(counts: xr.DataArray, cameras: str) -> Callable[[], xr.Dataset]:
     """Call of `solve`, for displaced cameras with a reflection shift that was found before."""
-    capture, response = counts.to_dataset(), _response()
-    apart = "shift" in CAMERAS[cameras]
-    shift = alignment.reflection_shift(capture, response) if apart else None
-    return partial(separation.solve, capture, response, reflection_shift=shift, workers=1)
+    capture, apart = counts.to_dataset(), "shift" in CAMERAS[cameras]
+    shift = alignment.reflection_shift(capture, response()) if apart else None
+    return partial(separation.solve, capture, response(), reflection_shift=shift, workers=1)
 
 
 def processor_time(call: Callable[[], T]) -> tuple[float, T]:
@@ -198,7 +191,7 @@ def default_rows(calls: Calls) -> Iterator[tuple[str, ...]]:
 
 
 @lru_cache
-def response(names: tuple[str, ...]) -> xr.Dataset:
+def response(names: tuple[str, ...] = BANDS[:2]) -> xr.Dataset:
     """Response of the rig of these bands; its fit is no part of a separation's time."""
     return simulation.Rig(bands=names, noise=NOISE[: len(names)]).response()
 

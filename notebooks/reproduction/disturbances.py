@@ -42,9 +42,8 @@ def expose(
     rates = [every] * bands if isinstance(every, int) else list(every)
     if not len(rates) == len(offsets) == bands:
         raise ValueError(f"Invalid every {every} and offsets {offsets}. Must be one for each band.")
-    steps = np.array(
-        [offset + np.arange(frames) * rate for offset, rate in zip(offsets, rates, strict=True)]
-    )
+    pairs = zip(offsets, rates, strict=True)
+    steps = np.array([offset + np.arange(frames) * rate for offset, rate in pairs])
     if min(rates) < 1 or steps.min() < 0 or steps.max() > last:
         raise ValueError(
             f"Invalid frames at steps {steps.min()} to {steps.max()}, every {every}. Must increase "
@@ -100,18 +99,6 @@ def fire_shutter(
     The shutter closes at times (event,) in the capture, stage `corrected`, for a duration [s], and
     the frame before is repeated; then each pixel steps by `offset_std` [count], standard deviation.
     Only the cameras of some bands close, if they are named.
-
-    Examples
-    --------
-    Closed for 0.25 s after 0.2 s: two frames repeat the one before.
-
-    >>> rng, time = np.random.default_rng(1), ("time", np.arange(6) / 10, {"units": "s"})
-    >>> ramp = np.arange(6.0).reshape(1, 6, 1, 1)
-    >>> counts = (("band", "time", "y", "x"), ramp, {"units": "count"})
-    >>> capture = xr.Dataset({"counts": counts}, {"band": ["8-14"], "time": time})
-    >>> closed = fire_shutter(capture, [0.2], rng, duration=0.25, offset_std=0.0)
-    >>> closed["counts"].values.ravel().tolist()
-    [0.0, 1.0, 2.0, 2.0, 2.0, 5.0]
     """
     counts = _floating(corrected)
     _numbers.real_number("duration [s]", duration, _numbers.POSITIVE)
@@ -171,17 +158,6 @@ def lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.Datase
     at rest before the first frame, of a time constant [s], of all bands or (band), by name;
     `correction.undo_lag` is the inverse. The capture, stage `corrected`, is without noise: that of
     the read-out does not pass through the pixel.
-
-    Examples
-    --------
-    A step of 100 counts through a pixel of 0.1 s, frame by frame every 0.1 s:
-
-    >>> step = np.array([0.0, 0.0, 100.0, 100.0, 100.0]).reshape(1, 5, 1, 1)
-    >>> counts = (("band", "time", "y", "x"), step, {"units": "count"})
-    >>> time = ("time", np.arange(5) / 10, {"units": "s"})
-    >>> capture = xr.Dataset({"counts": counts}, {"band": ["8-14"], "time": time})
-    >>> lag(capture, 0.1)["counts"].values.round().ravel().tolist()
-    [0.0, 0.0, 63.0, 86.0, 95.0]
     """
     counts = _floating(corrected)
     interval = np.diff(counts["time"].values.astype(np.float64))

@@ -261,21 +261,6 @@ def simulate(
     ----------
     .. [1] Alexander (1977), Diagonally Implicit Runge-Kutta Methods for Stiff O.D.E.'s, SIAM
        Journal on Numerical Analysis 14(6), doi:10.1137/0714068
-
-    Examples
-    --------
-    A square of glass in air, without conduction, relaxes with the time constant
-    :math:`\rho c d / h`, here 562.5 s.
-
-    >>> import trimesh
-    >>> from reproduction import heat
-    >>> corners = [[0.0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]]
-    >>> square = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]])
-    >>> plate = heat.Shell(square, 0.003, heat.GLASS)
-    >>> air = heat.Convection(10.0, 293.15)
-    >>> temperature = heat.simulate(plate, [0.0, 562.5], 303.15, [air], step=5.0)
-    >>> (temperature[-1] - 293.15).round(2).tolist()
-    [3.68, 3.68, 3.68, 3.68]
     """
     times = _times(time)
     limit = np.inf if step is None else float(require_positive("step [s]", step))

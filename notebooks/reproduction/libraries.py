@@ -11,33 +11,25 @@ from dbthermal import _text as texts
 from dbthermal._arrays import Array
 from dbthermal.readers._spectra import File, spectrum
 
+# Least and largest wavelength [micrometre] that a table must reach: a file that was cut is refused.
+_SLUM, _UCSB = (8.005, 13.99), (3.665, 14.5)
 
-def slum(path: str | Path, *, reach: tuple[float, float] = (8.005, 13.99)) -> dict[str, xr.Dataset]:
+
+def slum(path: str | Path) -> dict[str, xr.Dataset]:
     r"""Spectra of the Spectral Library of impervious Urban Materials, ``LUMA_SLUM_IR.csv``.
 
     A file with a column ``wavelength`` [micrometre], in steps that change little from one to the
-    next, and one of emissivity [1] per sample. The table must `reach` these wavelengths
-    [micrometre], by default those of the library, so that a file that was cut is refused. Maps the
-    sample code, such as ``"A001"``, to a spectrum as `ecostress`.
+    next, and one of emissivity [1] per sample. Maps the sample code, such as ``"A001"``, to a
+    spectrum as `ecostress`.
 
     OSError or ValueError as `ecostress`, or if the columns are not these, a row is short, missing
-    or added, or the table does not reach so far.
+    or added, or the table ends before those of the library.
 
     References
     ----------
     Kotthaus et al. (2014), Derivation of an urban materials spectral library through emittance and
     reflectance spectroscopy, ISPRS Journal of Photogrammetry and Remote Sensing 94, 194-212,
     doi:10.1016/j.isprsjprs.2014.05.005
-
-    Examples
-    --------
-    >>> from pathlib import Path
-    >>> from tempfile import TemporaryDirectory
-    >>> with TemporaryDirectory() as folder:
-    ...     path = Path(folder, "LUMA_SLUM_IR.csv")
-    ...     size = path.write_text("wavelength,A001,A002\n8.0,0.93,0.89\n14.0,0.95,0.97\n")
-    ...     slum(path)["A002"].emissivity.values.tolist()
-    [0.89, 0.97]
     """
     path = texts.as_path(path)
     titles, rows = _table(path)
@@ -48,27 +40,17 @@ def slum(path: str | Path, *, reach: tuple[float, float] = (8.005, 13.99)) -> di
     wavelength, *samples = texts.numbers(rows, len(titles), path.name).T
     notes, file = {"type": "manmade", "measurement": "emissivity"}, File(path.name, rows)
     return {
-        code: _reaching(wavelength, sample, notes | {"name": code, "sample_no": code}, file, reach)
+        code: _reaching(wavelength, sample, notes | {"name": code, "sample_no": code}, file, _SLUM)
         for code, sample in zip(codes, samples, strict=True)
     }
 
 
-def ucsb(path: str | Path, *, reach: tuple[float, float] = (3.665, 14.5)) -> xr.Dataset:
+def ucsb(path: str | Path) -> xr.Dataset:
     r"""Spectrum, as `ecostress`, of the MODIS UCSB emissivity library in comma-separated columns.
 
     Columns ``x1`` wavelength [micrometre], ``x2`` wavenumber [1/cm] and ``y_<name>`` emissivity
-    [1], in steps and with a `reach` as for `slum`. OSError or ValueError as `slum`, or if
-    wavelength and wavenumber disagree by more than 0.1 %.
-
-    Examples
-    --------
-    >>> from pathlib import Path
-    >>> from tempfile import TemporaryDirectory
-    >>> with TemporaryDirectory() as folder:
-    ...     path = Path(folder, "water.csv")
-    ...     size = path.write_text("x1,x2,y_water\n8.0,1250.0,0.985\n12.5,800.0,0.981\n")
-    ...     ucsb(path, reach=(8.0, 12.5)).emissivity.values.tolist()
-    [0.985, 0.981]
+    [1], in steps as for `slum`. OSError or ValueError as `slum`, or if wavelength and wavenumber
+    disagree by more than 0.1 %.
     """
     path = texts.as_path(path)
     titles, rows = _table(path)
@@ -80,7 +62,7 @@ def ucsb(path: str | Path, *, reach: tuple[float, float] = (3.665, 14.5)) -> xr.
         message = f"Invalid wavenumber {wavenumber[i]} 1/cm at {wavelength[i]} micrometres"
         raise ValueError(f"{file.at(i)}: {message}. Their product must be 10000.")
     notes = {"name": titles[2].removeprefix("y_"), "measurement": "emissivity"}
-    return _reaching(wavelength, emissivity, notes, file, reach)
+    return _reaching(wavelength, emissivity, notes, file, _UCSB)
 
 
 def _table(path: Path) -> tuple[list[str], list[texts.Row]]:
@@ -102,7 +84,7 @@ def _reaching(
     if low > shortest or high < longest:
         raise ValueError(
             f"Truncated '{file.name}': wavelengths from {low:g} to {high:g} micrometres. "
-            f"Must reach from {shortest:g} to {longest:g}, or as far as you say by reach=."
+            f"Must reach from {shortest:g} to {longest:g}."
         )
     steps = np.abs(np.diff(1 / wavelength))
     if steps.size < 3:

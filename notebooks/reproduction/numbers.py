@@ -24,14 +24,6 @@ def save(
 
     Name, unit included (``"object_rmse_K"``), to a finite number, a string or a boolean; TypeError
     or ValueError for any other value.
-
-    Examples
-    --------
-    >>> from tempfile import TemporaryDirectory
-    >>> with TemporaryDirectory() as folder:
-    ...     save({"object_rmse_K": 0.21}, f"{folder}/wall.json", {"parameters": {"frames": 2}})
-    ...     read(f"{folder}/wall.json")
-    {'object_rmse_K': 0.21}
     """
     content: dict[str, Any] = {
         "numbers": {name: _number(name, value) for name, value in numbers.items()},
@@ -58,13 +50,9 @@ def read(path: str | Path) -> dict[str, Number]:
 
 def table(rows: Iterable[Sequence[str]]) -> str:
     """Table in Markdown, the first row as its head."""
-    head, *lines = rows
-    rule = "|---" * len(head) + "|"
-    return "\n".join([_row(head), rule, *map(_row, lines)])
-
-
-def _row(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |"
+    rows = [*rows]
+    head, *lines = [f"| {' | '.join(cells)} |" for cells in rows]
+    return "\n".join([head, "|---" * len(rows[0]) + "|", *lines])
 
 
 def _digest(content: Mapping[str, Any]) -> str:

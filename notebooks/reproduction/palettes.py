@@ -192,54 +192,22 @@ def palette_video(
     palette fits better is refused.
 
     H.264 carries no checksum: of 200 files with one flipped bit, a block of zeros or a cut, up to
-    60 decode to other values without complaint. `sha256` excludes that.
+    60 decode to other values without complaint. `sha256`, of 64 lower-case digits, excludes that.
 
-    Parameters
-    ----------
-    path : str or Path
-        Regular file in MP4, MOV, Matroska, WebM or AVI, of one video that FFmpeg decodes. Addresses
-        and playlists are refused, and nothing that the file names is opened.
-    palette : str
-        Name of a continuous colour map of matplotlib, such as ``"plasma"`` or ``"turbo"``.
-    memory : float
-        Largest memory that the video may take, about 9 bytes a pixel and frame [byte]; refused
-        before it is taken.
-    sha256 : str, optional
-        Checksum of the file, 64 lower-case digits; the file is refused if it has another.
+    The file, in MP4, MOV, Matroska, WebM or AVI, is of one video that takes at most so much memory
+    [byte], about 9 a pixel and frame; a larger one is refused before it is taken. So are addresses
+    and playlists, and nothing that the file names is opened. The palette is a continuous colour map
+    of matplotlib.
 
-    Returns
-    -------
-    DataArray
-        Positions (time, y, x), float32 in [0, 1]; time [s] since the first frame, from the stream's
-        timestamps. Attributes: ``radiometric`` = 0, ``palette``, ``palette_residual`` (RMS distance
-        of the pixels from the palette in RGB, 0-255), ``palettes_compared`` (median
-        distances from each of them), ``source`` and a ``note``.
+    The result has positions (time, y, x), float32 in [0, 1]; time [s] since the first frame, from
+    the stream's timestamps. Attributes: ``radiometric`` = 0, ``palette``, ``palette_residual`` (RMS
+    distance of the pixels from the palette in RGB, 0-255), ``palettes_compared`` (median distances
+    from each of them), ``source`` and a ``note``.
 
-    Raises
-    ------
-    OSError
-        If the file cannot be opened.
-    TypeError, ValueError
-        If the palette is unknown or another fits better; the file is of another container or
-        checksum, takes more than `memory`, a number, cannot be decoded to its end or has a damaged
-        frame; its timestamps do not increase, or its frames or its length are not the declared
-        ones.
-
-    Examples
-    --------
-    A wedge drawn in plasma and encoded at 10 Hz comes back within 0.05.
-
-    >>> import numpy as np
-    >>> from tempfile import TemporaryDirectory
-    >>> from matplotlib import colormaps
-    >>> from dbthermal import store
-    >>> wedge = np.broadcast_to(np.linspace(0.1, 0.9, 64), (3, 48, 64))
-    >>> with TemporaryDirectory() as folder:
-    ...     frames = colormaps["plasma"](wedge, bytes=True)[..., :3]
-    ...     store.save_video(frames, f"{folder}/wedge.mp4", {}, rate=10.0)
-    ...     movie = palette_video(f"{folder}/wedge.mp4")
-    >>> bool(abs(movie - wedge).max() < 0.05), movie.time.values.tolist()  # [1], [s]
-    (True, [0.0, 0.1, 0.2])
+    OSError if the file cannot be opened. TypeError or ValueError if the palette is unknown or
+    another fits better; the file is of another container or checksum, is too large, cannot be
+    decoded to its end or has a damaged frame; its timestamps do not increase, or its frames or its
+    length are not the declared ones.
     """
     path = texts.as_path(path)
     colours = _palette(palette)
@@ -251,12 +219,7 @@ def palette_video(
 
 
 def masked_palette_video(
-    path: str | Path,
-    palette: str = "turbo",
-    width: int | None = None,
-    *,
-    memory: float = MEMORY,
-    sha256: str | None = None,
+    path: str | Path, palette: str = "turbo", width: int | None = None
 ) -> xr.Dataset:
     """Video whose object is drawn in a palette while the rest is gray; see `palette_video`.
 
@@ -271,7 +234,7 @@ def masked_palette_video(
     """
     path = texts.as_path(path)
     colours = _palette(palette)
-    video = _distinct(*_decode(path, width, memory, sha256))
+    video = _distinct(*_decode(path, width, MEMORY, None))
     position, from_palette, distance = _nearest(video.colours, colours)
     coloured = np.ptp(video.colours, axis=1) > _COLOURED
     if not coloured.any():
@@ -282,13 +245,8 @@ def masked_palette_video(
     attrs = _attrs(path, palette, float(residual), video.colours[coloured], share)
     dims = tuple(video.coords)
     mask_attrs = {"units": "1", "long_name": "nearer to the palette than to gray"}
-    return xr.Dataset(
-        {
-            "value": (dims, position[video.index], attrs),
-            "valid": (dims, valid[video.index], mask_attrs),
-        },
-        video.coords,
-    )
+    mask = (dims, valid[video.index], mask_attrs)
+    return xr.Dataset({"value": (dims, position[video.index], attrs), "valid": mask}, video.coords)
 
 
 @dataclass(frozen=True)

@@ -3,14 +3,15 @@
 Source of all published numbers: Narayanan, Ramanagopal, Narasimhan (2026), Dual Band Thermal
 Videography, CVPR, doi:10.48550/arXiv.2509.11334. Its captures are not public: ours are
 of simulations, of simulated twins of its scenes, of spectral libraries and of its published
-videos, and every row says of which.
+videos, and every row says of which. Rows that stand in no table of the paper are in paper.yaml.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from itertools import product
-from typing import Final
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
 
+from dbthermal import readers
 from reproduction.numbers import table
 
 _OBJECTS: Final = ("chrome ball", "aluminium cup", "blue paint", "glass jar", "wineglass")
@@ -142,7 +143,15 @@ def markdown(numbers: Numbers) -> str:
 
 def rows() -> tuple[Row, ...]:
     """Every number of the paper, and every figure, in the paper's order."""
-    return (*_FIRST, *_terms(), *_bench(), *_scenes(), *_LAST)
+    listed = readers.read_yaml(Path(__file__).with_suffix(".yaml"))
+    first, last = (map(_row, listed[part]) for part in ("first", "last"))
+    return (*first, *_terms(), *_bench(), *_scenes(), *last)
+
+
+def _row(entry: dict[str, Any]) -> Row:
+    """Row of an entry of paper.yaml, whose lists are tuples here."""
+    lists = {key: tuple(value) for key, value in entry.items() if isinstance(value, list)}
+    return Row(**entry | lists)
 
 
 def _terms() -> Iterator[Row]:
@@ -153,17 +162,11 @@ def _terms() -> Iterator[Row]:
 
 def _bench() -> Iterator[Row]:
     for procedure, name in (("paper", "bench"), ("reflector", "reflector")):
+        judged, within = ("distance", 0.01) if name == "bench" else ("value", 0.03)
         for thing, value in EMISSIVITIES[procedure].items():
-            yield Row(
-                "Table 2",
-                f"emissivity of the {thing}, {name}",
-                "07_bench",
-                (f"{thing}: {name} [1]",),
-                value,
-                judged="distance" if name == "bench" else "value",
-                within=0.01 if name == "bench" else 0.03,
-                reference=EMISSIVITIES["reference"][thing],
-            )
+            quantity, names = f"emissivity of the {thing}, {name}", (f"{thing}: {name} [1]",)
+            row = Row("Table 2", quantity, "07_bench", names, value, "1", judged, within)
+            yield replace(row, reference=EMISSIVITIES["reference"][thing])
 
 
 def _scenes() -> Iterator[Row]:
@@ -180,110 +183,6 @@ def _scenes() -> Iterator[Row]:
 
 
 _ROLES: Final = {"subspace": "emissivities unknown", "calibrated": "emissivities calibrated"}
-_METHODS: Final = ("subspace", "dbvt", "naive", "ratio, narrow", "bcp, patch 5", "apparent")
-_PAIRS: Final = ("8.5", "9.5", "10.6", "12.1")
-
-_FIRST: Final = (
-    Row(
-        "Fig. 1",
-        "image formation: object, background, path, optics, camera",
-        note="implemented",
-    ),
-    Row(
-        "Figs. 2 left, 10",
-        "error of the object temperature at moderate noise, median over materials",
-        "05_methods",
-        tuple(f"{name}: error at moderate noise [K]" for name in _METHODS),
-        unit="K",
-        labels=_METHODS,
-    ),
-    Row(
-        "Fig. 2 right",
-        "error of the emissivity at low noise, median over emissivities",
-        "05_methods",
-        tuple(f"{name}: emissivity error at the lowest noise [1]" for name in _METHODS[:2]),
-        labels=_METHODS[:2],
-    ),
-    Row(
-        "Fig. 3",
-        "error of the bunny's temperature, mean over frames, median over its pixels",
-        "08_twins",
-        tuple(f"{name}: error on the bunny [K]" for name in ("subspace", "naive")),
-        unit="K",
-        labels=("subspace", "naive"),
-    ),
-)
-
-_LAST: Final = (
-    *(
-        Row(
-            "section 5.2",
-            f"emissivity, estimated minus calibrated: {scene}, {band} \N{MICRO SIGN}m".replace(
-                "_", " "
-            ),
-            "08_twins",
-            (f"{scene}: emissivity unknown less calibrated, {band} [1]",),
-            value,
-            judged="error",
-        )
-        for (scene, band), value in zip(
-            product(("wineglass", "coffee_pot"), ("8-14", "9.5")),
-            (0.17, 0.15, 0.19, 0.15),
-            strict=True,
-        )
-    ),
-    Row(
-        "Fig. 4",
-        "emissivity of five objects in five bands, largest error in any series",
-        "07_bench",
-        ("largest error of the bench in any series [1]",),
-    ),
-    Row(
-        "Fig. 5",
-        "share of a fingerprint that is found as emission, of a finger's reflection as reflection",
-        "08_twins",
-        tuple(f"{name}: share found [1]" for name in ("fingerprint", "fingers")),
-        labels=("print", "reflection"),
-    ),
-    Row(
-        "Fig. 6",
-        "coffee pot: correlation of the reflection map with the authors' map",
-        "12_published",
-        ("coffeepot_map_correlation",),
-    ),
-    Row(
-        "Fig. 6",
-        "glass plate: correlation of the reflection map with the authors' map",
-        "12_published",
-        ("glass-plate_map_correlation",),
-    ),
-    Row(
-        "Fig. 7",
-        "residual of the Sakuma-Hattori curve and of the paper's line, 0 to 75 \N{DEGREE SIGN}C",
-        "01_calibration",
-        ("residual_8-14_K", "linear_residual_8-14_K"),
-        unit="K",
-        judged="alike",
-        within=2.0,
-        labels=("curve", "line"),
-    ),
-    Row(
-        "Fig. 8",
-        "error that the noise term removes, at the highest noise",
-        "06_optimiser",
-        ("noise: reduction at the highest noise [%]",),
-        unit="%",
-    ),
-    Row(
-        "Fig. 9",
-        "median condition number of 8-14 \N{MICRO SIGN}m and each filter",
-        "02_emissivity",
-        tuple(f"condition_8-14_{name}" for name in _PAIRS),
-        judged="lowest",
-        note="9.5",
-        labels=_PAIRS,
-    ),
-)
 
 
 def _text(value: float, unit: str) -> str:

@@ -33,15 +33,9 @@ class Run:
     """One run of a notebook, with its results in ``results/<name>/<stem>*``.
 
     Each result is saved with the provenance: the notebook's parameters, versions, commit, and the
-    checksums of the inputs that were opened before.
-
-    Parameters
-    ----------
-    stem : str
-        Name of the notebook, such as ``"03_simulation"``.
-    namespace : mapping
-        ``globals()`` of the notebook, with a value for each parameter in its YAML file, `results`
-        among them; else KeyError. What papermill injected is checked as by `parameters.check`.
+    checksums of the inputs that were opened before. The namespace is ``globals()`` of the notebook,
+    with a value for each parameter in its YAML file, `results` among them; else KeyError. What
+    papermill injected is checked as by `parameters.check`.
     """
 
     def __init__(self, stem: str, namespace: Mapping[str, Any]) -> None:
@@ -58,8 +52,7 @@ class Run:
 
     def input(self, name: str, path: Path) -> Path:
         """Path of an input, of which the provenance then holds the checksum; see `read`."""
-        with integrity.reading(path):
-            self.provenance["inputs"][name] = store.checksum(path)
+        self.provenance["inputs"][name] = self.read(store.checksum, path)
         return path
 
     def read(self, function: Callable[..., Any], path: Path, *args: Any, **options: Any) -> Any:
@@ -112,8 +105,7 @@ class Run:
 
     def cached(self, experiment: Callable[..., Any]) -> Callable[..., Any]:
         """Experiment whose results are kept, delayed for `joblib.Parallel`."""
-        kept = cache.kept(experiment, paths.cells(self.stem))
-        delayed: Callable[..., Any] = joblib.delayed(kept)
+        delayed: Callable[..., Any] = joblib.delayed(cache.kept(experiment, paths.cells(self.stem)))
         return delayed
 
     def finish(self, numbers: Numbers) -> Numbers:

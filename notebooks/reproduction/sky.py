@@ -26,6 +26,7 @@ _THERMOMETER, _PYRGEOMETER, _DOME = (0.10, 233.20), 194.10, 4.0
 # Thermistor YSI 44031, 1 / T = a + b ln R + c ln^3 R: a, b, c of the maker's table [1/K], [ohm].
 _THERMISTOR = (1.0295e-3, 2.391e-4, 1.568e-7)
 _RATE = 10.0  # of the pane's capture [Hz]
+_ATTRS = {"units": "K", "origin": "measured"}
 
 
 def readings(path: Path) -> xr.DataArray:
@@ -44,9 +45,7 @@ def readings(path: Path) -> xr.DataArray:
     step, zero = _THERMOMETER
     values = [step * data["inst_sfc_ir_temp"] + zero, (exitance / Stefan_Boltzmann) ** 0.25]
     coords = {"band": [*BANDS], "time": data["time_offset"].values}
-    return xr.DataArray(
-        values, coords, ("band", "time"), attrs={"units": "K", "origin": "measured"}
-    )
+    return xr.DataArray(values, coords, ("band", "time"), attrs=_ATTRS)
 
 
 def capture(temperatures: xr.DataArray, begin: float, end: float) -> xr.Dataset:
@@ -81,8 +80,7 @@ def spectra(path: Path, names: Sequence[str]) -> xr.DataArray:
         within = np.trapezoid(radiance[:, in_band], wavenumber[in_band], axis=1)
         temperatures.append(band.temperature(within))
     coords = {"band": [*names], "time": time}
-    attrs = {"units": "K", "origin": "measured"}
-    return xr.DataArray(temperatures, coords, ("band", "time"), attrs=attrs)
+    return xr.DataArray(temperatures, coords, ("band", "time"), attrs=_ATTRS)
 
 
 def gains(sky: xr.DataArray) -> xr.DataArray:

@@ -73,9 +73,8 @@ def inputs(files: Mapping[str, Path], name: str) -> xr.DataArray:
 
     Raises a FileNotFoundError without such a video, a ValueError if the two differ in shape.
     """
-    movies = [
-        palettes.palette_video(_file(files, f"{name}-{number}-bg.mp4")) for number in BANDS.values()
-    ]
+    names = [f"{name}-{number}-bg.mp4" for number in BANDS.values()]
+    movies = [palettes.palette_video(_file(files, name)) for name in names]
     if movies[0].shape != movies[1].shape:
         message = f"Invalid shapes {movies[0].shape}, {movies[1].shape} of scene '{name}'"
         raise ValueError(f"{message}. Must agree.")
@@ -83,9 +82,8 @@ def inputs(files: Mapping[str, Path], name: str) -> xr.DataArray:
     band = xr.DataArray(list(BANDS), dims="band", name="band")
     together = xr.concat(movies, band, combine_attrs="drop_conflicts")
     fits = [movie.attrs["palette_residual"] for movie in movies]
-    return together.assign_attrs(
-        radiometric=0, scene=name, origin="published video", palette_residual=fits
-    )
+    attrs = {"radiometric": 0, "scene": name, "origin": "published video"}
+    return together.assign_attrs(attrs, palette_residual=fits)
 
 
 def first_frame(
@@ -242,14 +240,10 @@ def report(compared: Mapping[str, Comparison]) -> str:
     heads = ("scene", "still edges [pixel]", "reflections [pixel]", "their correlation, at 0")
     shifts, rows, notes = [heads], [("scene", "way", *columns)], []
     for name, comparison in compared.items():
-        displacements = [
-            f"{float(displacement.sel(axis='x')):.2f}"
-            for displacement in (comparison.edges, comparison.reflections)
-        ]
-        peak, at_0 = (
-            comparison.reflections.attrs[key] for key in ("correlation", "correlation_at_0")
-        )
-        shifts.append((name, displacements[0], displacements[1], f"{peak:.2f}, {at_0:.2f}"))
+        edges, reflections = comparison.edges, comparison.reflections
+        still, moving = (f"{float(shift.sel(axis='x')):.2f}" for shift in (edges, reflections))
+        peak, at_0 = (reflections.attrs[key] for key in ("correlation", "correlation_at_0"))
+        shifts.append((name, still, moving, f"{peak:.2f}, {at_0:.2f}"))
         for way in WAYS:
             scores = comparison.table.sel(way=way).values.ravel()
             rows.append((name, way, *(f"{score:.3f}" for score in scores)))

@@ -15,6 +15,7 @@ from dbthermal import alignment, schema, separation, simulation, store
 from reproduction import disturbances, twins
 from reproduction.experiments.pictures import Picture, smooth_shift
 from reproduction.experiments.twins import capture_of
+from reproduction.twins import stage
 
 RIG = simulation.Rig()
 RESPONSE = RIG.response()
@@ -186,7 +187,7 @@ def test_reflections_that_mostly_change_slowly(seed: int) -> None:
     rng = np.random.default_rng(seed)
     drawing = replace(capture_of("plate window glass", (84, 112), (300, 10.0), 0.04), rays=2)
     scene = twins.twin("wineglass", drawing, rng)
-    capture = twins.registered(scene, twins.observe(scene, RESPONSE, rng))
+    capture = stage.registered(scene, stage.observe(scene, RESPONSE, rng))
     field = alignment.reflection_shift(capture, RESPONSE)
     moving = scene["background_temperature"].std("time").values > 0.1
     moving &= scene["on_object"].values & np.isfinite(scene["shift"].values).all(axis=0)

@@ -17,10 +17,11 @@ from reproduction.experiments.bench import (
     Sample,
     band_emissivity,
     bench_series,
+    compare_procedures,
     contact_measurements,
+    reflector_sensitivity,
     reflector_series,
 )
-from reproduction.experiments.procedures import compare_procedures, reflector_sensitivity
 
 STDS = (0.2, 0.3)  # of a contact reading and of the foil [K]
 TRUE = np.array([0.3, 0.45])

@@ -73,43 +73,34 @@ def test_two_processes_at_once(tmp_path: Path, marks: Path) -> None:
     assert any(result_of(str(marks)).identical(result) for result in results)
 
 
-@pytest.mark.parametrize("damage", ["truncated", "empty", "flipped", "removed", "no pickle"])
+DAMAGES = ["truncated", "empty", "flipped", "removed", "no pickle", "of other arguments"]
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
 def test_a_damaged_file_is_computed_again(
     tmp_path: Path, marks: Path, caplog: pytest.LogCaptureFixture, damage: str
 ) -> None:
-    """A result of which any file is cut, empty, flipped or gone is computed again."""
+    """A result whose file is cut, empty, flipped, gone or another result's is computed again."""
     experiment = cache.kept(counted, tmp_path / "cells")
     first = experiment(str(marks), 1.0, 1)
     (path,) = (file for file in (tmp_path / "cells").rglob("*") if file.is_file())
-    whole = path.read_bytes()
-    places = range(0, len(whole), len(whole) // 50) if damage == "flipped" else [len(whole) // 2]
+    whole, half = path.read_bytes(), path.stat().st_size // 2
+    experiment(str(marks), 1.0, 2)
+    (other,) = {*path.parent.iterdir()} - {path}
+    places = range(0, len(whole), len(whole) // 50) if damage == "flipped" else [half]
     for place in places:
-        path.write_bytes(whole[: 0 if damage == "empty" else place])
-        if damage == "flipped":
-            flipped = bytes([whole[place] ^ 1 << place % 8])
-            path.write_bytes(whole[:place] + flipped + whole[place + 1 :])
+        flipped = whole[:place] + bytes([whole[place] ^ 1 << place % 8]) + whole[place + 1 :]
+        contents = {"truncated": whole[:place], "empty": b"", "flipped": flipped, "removed": b""}
+        contents["no pickle"] = zlib.compress(b"spoilt")  # whole for zlib
+        path.write_bytes(contents.get(damage, other.read_bytes()))
         if damage == "removed":
             path.unlink()
-        if damage == "no pickle":  # whole for zlib
-            path.write_bytes(zlib.compress(b"spoilt"))
         xr.testing.assert_identical(experiment(str(marks), 1.0, 1), first)
-    assert calls(marks) == 1 + len(places)
+    assert calls(marks) == 2 + len(places)
     said = [record.getMessage() for record in caplog.records]
     again = [f"Damaged result '{path}'. It is computed again."]
     assert said == (damage != "removed") * len(places) * again
-    assert list(path.parent.iterdir()) == [path]
-
-
-def test_a_file_of_other_arguments_is_computed_again(tmp_path: Path, marks: Path) -> None:
-    """A result that has another's name is not its result."""
-    experiment = cache.kept(counted, tmp_path / "cells")
-    first, _ = (experiment(str(marks), 1.0, seed) for seed in (1, 2))
-    one, other = (file for file in (tmp_path / "cells").rglob("*.pkl"))
-    one.rename(one.with_suffix(""))
-    other.rename(one)
-    one.with_suffix("").rename(other)
-    xr.testing.assert_identical(experiment(str(marks), 1.0, 1), first)
-    assert calls(marks) == 3
+    assert {*path.parent.iterdir()} == {path, other}
 
 
 def test_changed_code_starts_anew(

@@ -14,21 +14,11 @@ from reproduction.experiments.emulated import Bench
 
 SHAPE = (12, 16)
 RIG = simulation.Rig(gain_std=0.0, offset_std=0.0, bad_fraction=0.0)
-MATERIALS = ["plate window glass", "silver paint"]
-PLACES = {
-    name: (slice(2, 10), slice(8 * number, 8 * number + 6)) for number, name in enumerate(MATERIALS)
-}
 
 
-def views(rig: simulation.Rig = RIG) -> emulated.Views:
+def views() -> emulated.Views:
     """Views of a small rig."""
-    detector = simulation.pattern(rig, SHAPE, np.random.default_rng(1))
-    return emulated.Views(rig, detector, seed=2)
-
-
-def expected(band: str, temperature: float) -> float:
-    """Counts of a blackbody."""
-    return float(responses.curve(RIG.response(), band).counts(np.array(temperature)))
+    return emulated.Views(RIG, simulation.pattern(RIG, SHAPE, np.random.default_rng(1)), seed=2)
 
 
 def test_blackbody_follows_the_world() -> None:
@@ -39,11 +29,12 @@ def test_blackbody_follows_the_world() -> None:
         world.blackbody_temperature = temperature
         for band, picture in pictures.items():
             frames = np.array([picture(0.0) for _ in range(100)], dtype=np.float64)
-            noise = float(RIG.response()["noise"].sel(band=band))
+            expected = responses.curve(RIG.response(), band).counts(np.array(temperature))
+            std = np.hypot(float(RIG.response()["noise"].sel(band=band)), 0.29)
             # 19,200 samples: their mean within five of its deviations, and the rounding's.
-            mean_std = np.hypot(noise, 0.29) / np.sqrt(frames.size)
-            assert frames.mean() == pytest.approx(expected(band, temperature), abs=5 * mean_std)
-            assert frames.std() == pytest.approx(np.hypot(noise, 0.29), rel=0.03)
+            mean_std = std / np.sqrt(frames.size)
+            assert frames.mean() == pytest.approx(float(expected), abs=5 * mean_std)
+            assert frames.std() == pytest.approx(std, rel=0.03)
 
 
 def test_recordings_have_each_its_own_noise() -> None:

@@ -59,12 +59,6 @@ class Papermill:
             raise self.error
 
 
-def replaced(monkeypatch: pytest.MonkeyPatch, stand_in: Papermill) -> Papermill:
-    """Put the stand-in where papermill is."""
-    monkeypatch.setattr(papermill, "execute_notebook", stand_in)
-    return stand_in
-
-
 def test_a_name_stands_for_results_on_the_disk(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -72,7 +66,8 @@ def test_a_name_stands_for_results_on_the_disk(
     a power loss leaves no name of what is only in the system's cache. They are as old as its
     beginning: a source that changed since is newer.
     """
-    runner = replaced(monkeypatch, Papermill(2))
+    runner = Papermill(2)
+    monkeypatch.setattr(papermill, "execute_notebook", runner)
     synced: list[tuple[Path, bool]] = []
     named = folder / "03_tiny.ipynb"
     monkeypatch.setattr(
@@ -103,7 +98,7 @@ def test_an_unfinished_notebook_leaves_nothing_whole(
     folder: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException | None
 ) -> None:
     """A notebook that does not reach its end is kept apart, and none of its results is."""
-    replaced(monkeypatch, Papermill(1, error))
+    monkeypatch.setattr(papermill, "execute_notebook", Papermill(1, error))
     with pytest.raises(type(error) if error else RuntimeError, match=None if error else "cell 1"):
         execute.execute("full", "03_tiny", {})
     assert [path.name for path in folder.iterdir()] == ["04_other.json"]
@@ -138,15 +133,10 @@ def test_values_are_refused(project: Path, text: str, message: str) -> None:
         parameters.read("03_tiny", [path])
 
 
-@pytest.mark.usefixtures("project")
-def test_the_full_values_are_complete() -> None:
-    """A file of full values that was cut does not leave small ones in a full run."""
-    with pytest.raises(ValueError, match=r"Missing parameter 'known' in '.*03_tiny\.yaml'"):
-        parameters.read("03_tiny", [Path("params/03_tiny.yaml")])
-
-
 def test_values_are_taken_in_order(project: Path) -> None:
-    """A later file's value replaces an earlier one's, and a text replaces both, once."""
+    """A later file's value replaces an earlier one's, and a text replaces both, once; a file of
+    full values that was cut does not leave small ones in a full run.
+    """
     files = [project / "a.yaml", project / "b.yaml"]
     files[0].write_text("frames: 4\nrate: 3\nplate: {shape: [], kind: a}")
     files[1].write_text("frames: 5")
@@ -157,6 +147,8 @@ def test_values_are_taken_in_order(project: Path) -> None:
         parameters.read("03_tiny", files, [("recorded", "a"), ("recorded", "b")])
     with pytest.raises(ValueError, match="Unknown parameter 'recordings' in the texts"):
         parameters.read("03_tiny", files, [("recordings", "a")])
+    with pytest.raises(ValueError, match=r"Missing parameter 'known' in '.*03_tiny\.yaml'"):
+        parameters.read("03_tiny", [Path("params/03_tiny.yaml")])
 
 
 @pytest.mark.usefixtures("project")

@@ -11,34 +11,22 @@ from sketches import array
 from reproduction import figures
 
 
-def draw_compared(fill: float = 1.0, **attrs: object) -> Figure:
+def draw_compared(fill: float = 1.0) -> Figure:
     """Draw two maps of the reflection at two times."""
-    movie = (fill * array("time y x", 2, 5, 6)).assign_attrs(attrs)
+    movie = fill * array("time y x", 2, 5, 6)
     return figures.comparison.compared_reflections(movie, movie, array("time", 2) - 300.5)
 
 
-def draw_condition(fill: float = 1.0, **attrs: object) -> Figure:
+def draw_condition(fill: float = 1.0) -> Figure:
     """Draw the condition number of a pair of bands, infinite on the diagonal."""
-    matrix = fill * array("first second", 2, 2, **attrs)
+    matrix = fill * array("first second", 2, 2)
     matrix = matrix.where(matrix["first"] != matrix["second"], np.inf)
     return figures.calibration.condition_matrix(matrix, 9)
 
 
-def draw_over_bound(**attrs: object) -> Figure:
-    """Draw errors of 1.2 times one of two bounds, the other of which is missing once."""
-    over = {"noise": [0.01, 0.03, 0.1], "case": ["known", "free"]}
-    bound = np.array([[1.0, 2.0, 4.0], [0.5, 1.0, 2.0]])
-    parts: dict[str, tuple[object, np.ndarray]] = {}
-    for name in ("reflection_ratio", "object_temperature"):
-        parts[f"{name}_error"] = ("noise", 1.2 * bound[0])
-        parts[f"{name}_bound"] = (("case", "noise"), bound.copy())
-    parts["object_temperature_bound"][1][1, 0] = np.nan
-    return figures.comparison.error_over_bound(xr.Dataset(parts, over, attrs))
-
-
-def draw_pooled(fill: float = 1.0, **attrs: object) -> Figure:
+def draw_pooled(fill: float = 1.0) -> Figure:
     """Draw the ratios of two materials, one pixel without a label."""
-    ratio = (fill * array("y x", 5, 6)).assign_attrs(attrs)
+    ratio = fill * array("y x", 5, 6)
     panels = xr.DataArray(np.indices((5, 6))[1] // 3, dims=("y", "x"))
     labels = panels.copy()
     labels[0, 0] = -1
@@ -53,10 +41,9 @@ def separated(fill: float = 1.0) -> xr.Dataset:
     return xr.Dataset(parts)
 
 
-def draw_truth(fill: float = 1.0, **attrs: object) -> Figure:
+def draw_truth(fill: float = 1.0) -> Figure:
     """Draw the truth of a pixel beside its estimate."""
-    truth = separated().assign_attrs(attrs)
-    return figures.scenes.truth_and_estimate(truth, separated(fill), (1, 2))
+    return figures.scenes.truth_and_estimate(separated(), separated(fill), (1, 2))
 
 
 def test_film() -> None:
@@ -108,14 +95,23 @@ def test_condition_numbers_of_pairs() -> None:
 
 
 def test_errors_are_in_units_of_their_bound() -> None:
-    """Two bounds and one row of errors above; below an error of 1.2 times its bound at 1.2."""
-    above, _, below, _ = draw_over_bound().axes
+    """Two bounds, of which one is missing once, and one row of errors above; below an error of 1.2
+    times its bound at 1.2.
+    """
+    over = {"noise": [0.01, 0.03, 0.1], "case": ["known", "free"]}
+    bound = np.array([[1.0, 2.0, 4.0], [0.5, 1.0, 2.0]])
+    parts: dict[str, tuple[object, np.ndarray]] = {}
+    for name in ("reflection_ratio", "object_temperature"):
+        parts[f"{name}_error"] = ("noise", 1.2 * bound[0])
+        parts[f"{name}_bound"] = (("case", "noise"), bound.copy())
+    parts["object_temperature_bound"][1][1, 0] = np.nan
+    above, _, below, _ = figures.comparison.error_over_bound(xr.Dataset(parts, over)).axes
     assert [line.get_label() for line in above.lines] == ["known, bound", "free, bound", "measured"]
     assert len(below.lines) == 3
     np.testing.assert_allclose(np.asarray(below.lines[0].get_ydata()), 1.2, rtol=1e-12)
 
 
-@pytest.mark.parametrize("name", [name for name in figures.__all__ if name != "separated_film"])
+@pytest.mark.parametrize("name", figures.__all__)
 def test_a_figure_names_the_kind_of_its_data(name: str) -> None:
     """Simulated data and pictures are called so in the title; that labels have units, see `Run`."""
     assert "provenance_note(" in inspect.getsource(getattr(figures, name))

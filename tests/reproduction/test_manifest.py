@@ -191,31 +191,27 @@ def test_download(served: Path, project: Path) -> None:
         ("to-ftp:  127.0.0.1 x.txt", "Invalid redirect of 'http.*' to 'ftp://127.0.0.1/x'"),
         ("to-file:   etc passwd.txt", "Invalid redirect of 'http.*' to 'file:///etc/passwd'"),
         ("to-.. all%20notes to-two.txt.txt", "404"),
+        ("slow.txt", r"Slow download of 'http.*slow\.txt'"),
     ],
 )
 def test_a_download_that_misbehaves(
     served: Path, project: Path, name: str, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A download that is too large, or leads to another scheme, ends and leaves nothing."""
+    """A download that is too large, leads to another scheme, or trickles on after the time that its
+    listed size allows, ends and leaves nothing.
+    """
     assert served.is_dir()
     monkeypatch.setattr(
         manifest.Collection, "url", lambda self, _: quote(f"{self.origin}{name}", ":/")
     )
+    if name == "slow.txt":
+        for size in ("bytes: 5", "bytes: 6"):
+            edit(project, size, "bytes: 1000")
+        for limit, value in (("_SLOWEST", 5000), ("_TIMEOUT", 0.3)):
+            monkeypatch.setattr(manifest, limit, value)
     with pytest.raises(OSError, match=message):
         manifest.fetch_collection("notes")
     assert not any((project / "data" / "notes").iterdir())
-
-
-def test_a_slow_download_ends(served: Path, project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A download that trickles on ends after the time that its listed size allows."""
-    assert served.is_dir()
-    for size in ("bytes: 5", "bytes: 6"):
-        edit(project, size, "bytes: 1000")
-    for name, value in (("_SLOWEST", 5000), ("_TIMEOUT", 0.3)):
-        monkeypatch.setattr(manifest, name, value)
-    monkeypatch.setattr(manifest.Collection, "url", lambda self, _: f"{self.origin}slow.txt")
-    with pytest.raises(OSError, match=r"Slow download of 'http.*slow\.txt'"):
-        manifest.fetch_collection("notes")
 
 
 @pytest.mark.parametrize("folder", [False, True])

@@ -41,12 +41,8 @@ def capture_of(counts: list[Floats], names: tuple[str, ...] = RIG.bands) -> xr.D
 
 def seen(warm: Floats, cold: Floats, emissivity: tuple[float, float]) -> xr.Dataset:
     """Capture of an object before a background, both (time, y, x) [K]."""
-    return capture_of(
-        [
-            mixing.leaving(e, curve.counts(warm), curve.counts(cold))
-            for e, curve in zip(emissivity, CURVES, strict=True)
-        ]
-    )
+    pairs = zip(emissivity, CURVES, strict=True)
+    return capture_of([mixing.leaving(e, it.counts(warm), it.counts(cold)) for e, it in pairs])
 
 
 def solve(capture: xr.Dataset, method: str, settings: Any = None, **options: Any) -> xr.Dataset:
@@ -55,11 +51,16 @@ def solve(capture: xr.Dataset, method: str, settings: Any = None, **options: Any
     return separation.solve(capture, RESPONSE, record, settings=settings, **options)
 
 
+def drawn(time: Floats, pixels: int, rng: np.random.Generator) -> xr.Dataset:
+    """Scene of glass heated from 20 to 60 C, someone walking by."""
+    glass = simulation.independent_pixels
+    return glass(time, GLASS, Background(), pixels, rng, start=293.15, stop=333.15)
+
+
 @pytest.fixture(scope="module")
 def heated() -> xr.Dataset:
-    """Scene of thirty pixels heated from 20 to 60 C, someone walking by."""
-    rng, span = np.random.default_rng(2), dict[str, Any](start=293.15, stop=333.15)
-    return simulation.independent_pixels(TIME, GLASS, Background(), 30, rng, **span)
+    """Scene of thirty pixels."""
+    return drawn(TIME, 30, np.random.default_rng(2))
 
 
 @pytest.fixture(scope="module")
@@ -87,8 +88,13 @@ def test_naive_meets_the_images_and_is_wrong(glass: xr.Dataset, heated: xr.Datas
     assert float(of_emissivity.max()) > 0.1
 
 
-def test_naive_says_when_it_stopped_early(glass: xr.Dataset) -> None:
-    """A pixel is flagged as not converged after one step, and not after a hundred."""
+def test_too_few_steps_are_flagged(glass: xr.Dataset) -> None:
+    """A pixel that still improves at its last step is flagged as not converged; not after a hundred
+    of the naive method.
+    """
+    _, capture, response = noisy(QUIET, 8)
+    result = separation.solve(capture, response, DBVT, settings=DbvtSettings(stages=1, steps=2))
+    assert np.all(result["status"].values & schema.Status.NOT_CONVERGED)
     early, late = (
         schema.has_flag(solve(glass, "naive", settings)["status"], "not_converged")
         for settings in (NaiveSettings(iterations=1), NaiveSettings())
@@ -107,11 +113,7 @@ test_settings_outside_their_range = refused(
         (DbvtSettings, {"huber": -1.0}, "Invalid huber -1.0 of method 'dbvt'. Must be at least 0."),
         (DbvtSettings, {"curvature": 0.0}, "curvature of method 'dbvt'"),
         (DbvtSettings, {"starts": 0}, "Invalid starts 0 of method 'dbvt'. Must be at least 1."),
-        (
-            DbvtSettings,
-            {"margin": 0.5},
-            r"Invalid margin 0.5 of method 'dbvt'. Must lie in \(0, 0.5",
-        ),
+        (DbvtSettings, {"margin": 0.5}, "margin 0.5 of method 'dbvt'. Must lie in (0, 0.5)"),
         (DbvtSettings, {"start": "truth"}, "Unknown start 'truth' of method 'dbvt'. Must be one"),
         (BcpSettings, {"patch": 4}, "Invalid patch 4 of method 'bcp'. Must be odd."),
         (BcpSettings, {"patch": "15"}, "patch '15' of method"),
@@ -171,14 +173,6 @@ def test_ratio_smooths_before_it_divides() -> None:
     assert plain / smooth == pytest.approx(24**0.5, rel=0.2)
 
 
-def test_ratio_refuses_a_stationary_pair() -> None:
-    """10.6 against 8-14 um turns near 33 C: no temperature follows from its ratio."""
-    names = ("8-14", "10.6")
-    capture = capture_of([20000.0 + WARM, 20000.0 + WARM], names)
-    with pytest.raises(ValueError, match=r"'8-14', '10.6' .* stationary near 30\d\.\d K"):
-        separation.solve(capture, Rig(bands=names).response(), methods.get_method("ratio"))
-
-
 HOT, ROOM = 320.0, 295.0
 EXACT: dict[str, Any] = {"window": 1, "reflected_temperature": ROOM}  # smooths nothing
 
@@ -208,10 +202,22 @@ def test_bcp_by_hand() -> None:
     np.testing.assert_allclose(found["background_temperature"], ROOM, **close)
 
 
-def test_bcp_refuses_a_room_beyond_the_response() -> None:
-    """A reflected temperature outside the response's range raises a ValueError."""
-    with pytest.raises(ValueError, match=r"Invalid reflected_temperature 500\.0 K"):
-        solve(half_black(), "bcp", BcpSettings(reflected_temperature=500.0))
+def stationary() -> xr.Dataset:
+    """Separation by the ratio of 10.6 and 8-14 um, which turns near 33 C: two temperatures fit."""
+    names = ("8-14", "10.6")
+    capture = capture_of([20000.0 + WARM, 20000.0 + WARM], names)
+    return separation.solve(capture, Rig(bands=names).response(), methods.get_method("ratio"))
+
+
+BEYOND = BcpSettings(reflected_temperature=500.0)
+test_what_has_no_answer = refused(
+    lambda call: call(),
+    [
+        (stationary, r"'8-14', '10.6' .* stationary near 30\d\.\d K"),
+        (lambda: solve(half_black(), "bcp", BEYOND), r"Invalid reflected_temperature 500\.0 K"),
+    ],
+    error=ValueError,
+)
 
 
 def test_medians_count_what_the_default_solves() -> None:
@@ -237,10 +243,9 @@ Scene = tuple[xr.Dataset, xr.Dataset, xr.Dataset]
 
 
 def noisy(noise: tuple[float, float], pixels: int) -> Scene:
-    """Scene, capture and response: glass from 20 to 60 C, someone walking by."""
+    """Scene of pixels, its capture and its response."""
     rig, rng = Rig(noise=noise), np.random.default_rng(41)
-    span: Any = {"start": 293.15, "stop": 333.15}
-    scene = simulation.independent_pixels(LONG, GLASS, Background(), pixels, rng, **span)
+    scene = drawn(LONG, pixels, rng)
     return scene, simulation.observe(scene, rig.response(), rng), rig.response()
 
 
@@ -291,10 +296,3 @@ def test_exact_response_is_taken_out() -> None:
         for settings in (DbvtSettings(bend_updates=0), None)
     )
     assert straight[0] < 0.5 * bent[0]
-
-
-def test_too_few_steps_are_flagged() -> None:
-    """A pixel that still improves at its last step is flagged as not converged."""
-    _, capture, response = noisy(QUIET, 8)
-    result = separation.solve(capture, response, DBVT, settings=DbvtSettings(stages=1, steps=2))
-    assert np.all(result["status"].values & schema.Status.NOT_CONVERGED)

@@ -79,15 +79,13 @@ def test_cells_compose(path: Path) -> None:
         assert len(cell.source.splitlines()) <= longest, cell.source
 
 
-def code_lines(path: Path) -> list[str]:
-    """Lines of code without those of the parameters, imports, comments and blanks."""
-    plain = [it for it in cells(path, "code") if "parameters" not in it.metadata.get("tags", ())]
-    lines = [line.strip() for cell in plain for line in cell.source.splitlines()]
-    return [line for line in lines if line and not line.startswith(("#", "import ", "from "))]
-
-
 def test_bookkeeping_is_a_small_share() -> None:
-    """Few code lines are about the paths of inputs and results."""
-    lines = [line for path in NOTEBOOKS for line in code_lines(path)]
+    """Few code lines are about the paths of inputs and results, beside the parameters, imports,
+    comments and blanks.
+    """
+    code = [cell for path in NOTEBOOKS for cell in cells(path, "code")]
+    plain = [cell for cell in code if "parameters" not in cell.metadata.get("tags", ())]
+    lines = [line.strip() for cell in plain for line in cell.source.splitlines()]
+    lines = [line for line in lines if line and not line.startswith(("#", "import ", "from "))]
     kept = sum(bool(BOOKKEEPING.search(line)) for line in lines)
     assert kept / len(lines) <= LARGEST_SHARE, f"{kept} of {len(lines)} lines"

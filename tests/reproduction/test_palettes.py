@@ -25,15 +25,6 @@ def plasma(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return video(tmp_path_factory.mktemp("film") / "plasma.mp4")
 
 
-@pytest.fixture(scope="module")
-def masked(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Video of the wave in turbo in the left half, gray in the right half, then a bar in turbo."""
-    frames = np.full((12, 48, 80, 3), 90, dtype=np.uint8)
-    frames[:, :, :32] = coloured(wave(), "turbo")[:, :, :32]
-    frames[:, :, 64:] = coloured(np.linspace(0, 1, 48), "turbo")[:, None]
-    return video(tmp_path_factory.mktemp("film") / "masked.mp4", frames)
-
-
 def test_palette_video_gives_positions_and_times(plasma: Path) -> None:
     """The wave is recovered within 1 % of the palette, at 10 frames per second."""
     movie = palettes.palette_video(plasma)
@@ -48,8 +39,15 @@ def test_palette_video_gives_positions_and_times(plasma: Path) -> None:
     assert "not radiometric" in movie.attrs["note"]
 
 
-def test_masked_palette_video(masked: Path) -> None:
-    """The object's half is valid, the gray half is not, and the printed bar is cut off."""
+def test_masked_palette_video(tmp_path: Path) -> None:
+    """The object's half, in turbo, is valid, the gray half is not, and the printed bar is cut off;
+    a width beyond the video's, another palette than the object's, and no object at all are refused.
+    """
+    frames = np.full((12, 48, 80, 3), 90, dtype=np.uint8)
+    gray = video(tmp_path / "gray.mp4", frames)
+    frames[:, :, :32] = coloured(wave(), "turbo")[:, :, :32]
+    frames[:, :, 64:] = coloured(np.linspace(0, 1, 48), "turbo")[:, None]
+    masked = video(tmp_path / "masked.mp4", frames)
     movie = palettes.masked_palette_video(masked, width=64)
     assert dict(movie.sizes) == {"time": 12, "y": 48, "x": 64}
     assert movie["valid"].isel(x=slice(30)).mean() > 0.99
@@ -57,28 +55,18 @@ def test_masked_palette_video(masked: Path) -> None:
     inside = movie["value"].isel(x=slice(30)) - wave()[:, :, :30]
     assert_allclose(np.sqrt(np.mean(inside**2)), 0, atol=0.01)
     assert movie["value"].attrs["radiometric"] == 0
-
-
-test_another_palette_is_refused = refused(
-    palettes.palette_video,
-    [
-        *((name, f"Palette '{name}' does not fit.*from 'plasma'") for name in ("turbo", "gray")),
-        *((name, f"Unknown palette '{name}'") for name in ("plasmatic", "tab10")),
-    ],
-    "plasma",
-)
-
-
-def test_masked_videos_are_refused(masked: Path, tmp_path: Path) -> None:
-    """A width beyond the video's, another palette than the object's, and no object at all."""
     for width in (0, 81):
         with pytest.raises(ValueError, match=f"Invalid width {width} .* from 1 to 80 pixels"):
             palettes.masked_palette_video(masked, width=width)
     with pytest.raises(ValueError, match=r"Palette 'plasma' does not fit.*from 'turbo'"):
         palettes.masked_palette_video(masked, "plasma")
-    path = video(tmp_path / "gray.mp4", np.full((3, 16, 16, 3), 90, dtype=np.uint8))
     with pytest.raises(ValueError, match=r"No coloured pixel in 'gray\.mp4'"):
-        palettes.masked_palette_video(path)
+        palettes.masked_palette_video(gray)
+
+
+PALETTES = [(name, f"Palette '{name}' does not fit.*from 'plasma'") for name in ("turbo", "gray")]
+PALETTES += [(name, f"Unknown palette '{name}'") for name in ("plasmatic", "tab10")]
+test_another_palette_is_refused = refused(palettes.palette_video, PALETTES, "plasma")
 
 
 @pytest.mark.data
@@ -92,14 +80,10 @@ def test_published_scene(mirror: Path) -> None:
     assert_allclose(separated["valid"].mean(), 0.356, rtol=0, atol=0.01)
 
 
-@pytest.mark.parametrize(
-    "number",
-    [
-        30,
-        pytest.param(100, marks=pytest.mark.slow, id="slow"),
-        pytest.param(1000, marks=pytest.mark.long),
-    ],
-)
+MARKED = {100: pytest.mark.slow, 1000: pytest.mark.long}
+
+
+@pytest.mark.parametrize("number", [30, *(pytest.param(n, marks=it) for n, it in MARKED.items())])
 @pytest.mark.parametrize("ending", hostile.CODECS)
 def test_videos(tmp_path: Path, ending: str, number: int) -> None:
     """No cut video passes with other frames; a codec without checksum hides some of the rest.

@@ -14,48 +14,36 @@ ROOT = Path(__file__).parents[2]
 REFERENCE = json.loads((ROOT / "tests" / "reference_numbers.json").read_text(encoding="utf-8"))
 
 
-def verdict(numbers: dict[str, float], names: tuple[str, ...], **rule: Any) -> str:
-    """Verdict of a row of some names by a rule."""
-    return Row("Fig.", "error", STEM, names, **rule).verdict({STEM: numbers})
+LOWEST = {"judged": "lowest", "note": "9.5", "labels": ("8.5", "9.5")}
 
 
 @pytest.mark.parametrize(
     ("ours", "rule", "expected"),
     [
-        (0.5, {"judged": "error"}, "smaller error"),
-        (0.95, {"judged": "error"}, "agrees"),
-        (1.05, {"judged": "error"}, "agrees"),
-        (1.2, {"judged": "error"}, "larger error"),
-        (1.2, {"judged": "value", "within": 0.25}, "agrees"),
-        (1.2, {"judged": "value", "within": 0.1}, "differs"),
-        (0.7, {"judged": "distance", "reference": 0.8}, "smaller error"),  # 0.1 away, the paper 0.2
-        (0.5, {"judged": "distance", "reference": 0.8}, "larger error"),
-        (0.99, {"judged": "distance", "reference": 0.8, "within": 0.02}, "agrees"),
-        (0.5, {"judged": "no"}, "no number published"),
+        ([0.5], {"judged": "error"}, "smaller error"),
+        ([0.95], {"judged": "error"}, "agrees"),
+        ([1.05], {"judged": "error"}, "agrees"),
+        ([1.2], {"judged": "error"}, "larger error"),
+        ([1.2], {"judged": "value", "within": 0.25}, "agrees"),
+        ([1.2], {"judged": "value", "within": 0.1}, "differs"),
+        ([0.7], {"judged": "distance", "reference": 0.8}, "smaller error"),  # 0.1; the paper 0.2
+        ([0.5], {"judged": "distance", "reference": 0.8}, "larger error"),
+        ([0.99], {"judged": "distance", "reference": 0.8, "within": 0.02}, "agrees"),
+        ([0.5], {"judged": "no"}, "no number published"),
+        ([1.0, 5.0], LOWEST, "differs"),
+        ([9.0, 5.0], LOWEST, "agrees"),
+        ([1.0, 1.5], {"judged": "alike", "within": 2.0}, "agrees"),
+        ([1.0, 4.0], {"judged": "alike", "within": 2.0}, "differs"),
     ],
 )
-def test_verdict(ours: float, rule: dict[str, Any], expected: str) -> None:
-    """An error is judged by its size, a value by its distance, of the paper's or of the truth."""
-    assert verdict({"x": ours}, ("x",), published=1.0, unit="K", **rule) == expected
-    assert verdict({}, ("x",), published=1.0, unit="K", **rule) == "not measured"
-
-
-@pytest.mark.parametrize(
-    ("numbers", "rule", "expected"),
-    [
-        ({"a": 1.0, "b": 5.0}, {"judged": "lowest"}, "differs"),
-        ({"a": 9.0, "b": 5.0}, {"judged": "lowest"}, "agrees"),
-        ({"b": 5.0}, {"judged": "lowest"}, "not measured"),
-        ({"a": 1.0, "b": 1.5}, {"judged": "alike", "within": 2.0}, "agrees"),
-        ({"a": 1.0, "b": 4.0}, {"judged": "alike", "within": 2.0}, "differs"),
-    ],
-)
-def test_verdict_on_two_numbers(
-    numbers: dict[str, float], rule: dict[str, Any], expected: str
-) -> None:
-    """The method that the paper names must have the lowest error; two that are alike, be so."""
-    note = {"note": "9.5", "labels": ("8.5", "9.5")} if rule["judged"] == "lowest" else {}
-    assert verdict(numbers, ("a", "b"), unit="", **rule, **note) == expected
+def test_verdict(ours: list[float], rule: dict[str, Any], expected: str) -> None:
+    """An error is judged by its size, a value by its distance, of the paper's or of the truth; the
+    method that the paper names must have the lowest error, and two that are alike, be so.
+    """
+    numbers = dict(zip("ab", ours, strict=False))
+    row = Row("Fig.", "error", STEM, tuple(numbers), published=1.0, unit="K", **rule)
+    assert row.verdict({STEM: numbers}) == expected
+    assert row.verdict({STEM: dict([*numbers.items()][1:])}) == "not measured"
 
 
 def test_half_a_row_is_shown() -> None:

@@ -149,12 +149,8 @@ def test_person_crosses_when_predicted() -> None:
 
 def test_the_nearest_actor_hides_the_others() -> None:
     """Of two bodies along a ray the nearer one is seen, in either order, as warm as it is now."""
-    mesh = ball(0.2).mesh
-    near = Actor(
-        mesh,
-        lambda now: np.full(len(mesh.vertices), 300 + now),
-        lambda _: Pose(translation=(0.0, -2.0, 0.0)),
-    )
+    mesh, pose = ball(0.2).mesh, Pose(translation=(0.0, -2.0, 0.0))
+    near = Actor(mesh, lambda now: np.full(len(mesh.vertices), 300 + now), lambda _: pose)
     far = ball(0.4, 310.0, motion=lambda _: Pose(translation=(0.0, -3.0, 0.0)))
     for actors in ([near, far], [far, near]):
         seen = incident(*RAY, np.arange(3.0), ROOM, actors)[:, 0]

@@ -40,8 +40,10 @@ def test_parameters_of_the_run(run: Run) -> None:
 
 
 def test_results_lie_under_the_stem(run: Run, tmp_path: Path) -> None:
-    """Datasets, figures, texts and numbers are saved; figures and numbers are handed back."""
-    figure, _ = figures.drawing.canvas(1, 1, (2.0, 2.0))
+    """Datasets, figures, texts and numbers are saved; figures and numbers are handed back. A figure
+    is refused unless each label of an axis with ticks says its unit.
+    """
+    figure, axes = figures.drawing.canvas(1, 1, (2.0, 2.0))
     run.save(DATASET)
     run.text("# Table", "_table")
     assert run.figure(figure, "_scene") is figure
@@ -51,11 +53,6 @@ def test_results_lie_under_the_stem(run: Run, tmp_path: Path) -> None:
     assert endings == [f"03_simulation{suffix}" for suffix in suffixes]
     saved = json.loads((tmp_path / "results/smoke/03_simulation.json").read_text())
     assert saved["provenance"] == run.provenance
-
-
-def test_a_figure_without_units_is_refused(run: Run) -> None:
-    """Each label of an axis with ticks says its unit."""
-    figure, axes = figures.drawing.canvas(1, 1, (2.0, 2.0))
     axes[0, 0].set(xlabel="time [s]", ylabel="error")
     with pytest.raises(ValueError, match=r"Invalid label 'error' of a figure\. Must have a unit"):
         run.figure(figure, "_scene")
@@ -78,20 +75,14 @@ def test_experiment_is_cached(run: Run, tmp_path: Path) -> None:
     assert len(list((tmp_path / "results" / "cells" / "03_simulation").rglob("*.pkl"))) == 1
 
 
-@pytest.fixture
-def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Empty project, with the current folder inside its notebooks."""
-    (tmp_path / "data_manifest.yaml").touch()
-    (tmp_path / "notebooks").mkdir()
-    monkeypatch.chdir(tmp_path / "notebooks")
-    return tmp_path.resolve()
-
-
-def test_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, project: Path) -> None:
+@pytest.mark.usefixtures("run")
+def test_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The folder of the manifest is the root, from below, or from the package's own folder.
 
     Without a manifest anywhere the error says where it was sought.
     """
+    project = tmp_path.resolve()
+    monkeypatch.chdir(tmp_path / "params")
     assert paths.root() == project
     monkeypatch.setattr(paths, "__file__", str(project / "dbthermal" / "paths.py"))
     monkeypatch.chdir(tmp_path.parent)
@@ -102,7 +93,7 @@ def test_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, project: Path) ->
         paths.root()
 
 
-@pytest.mark.usefixtures("project")
+@pytest.mark.usefixtures("run")
 def test_names_are_no_paths() -> None:
     """A run is one folder's name, a stem begins with two digits, an ending has a suffix."""
     table: list[tuple[str, Callable[[str], Path], tuple[str, ...]]] = [

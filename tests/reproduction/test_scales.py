@@ -15,6 +15,7 @@ TIME = np.arange(FRAMES) / 10.0  # s
 RATIO = 2.0
 NOISE = np.array([0.004, 0.005])
 STILL = np.broadcast_to(np.arange(WIDTH) >= 30, (HEIGHT, WIDTH))
+WALL = xr.DataArray(STILL, dims=("y", "x"))  # pixels off the object
 
 
 def scene(rng: np.random.Generator, *, walkers: bool = False) -> tuple[Floats, Floats]:
@@ -35,21 +36,18 @@ def scene(rng: np.random.Generator, *, walkers: bool = False) -> tuple[Floats, F
     return np.stack([object_part + reflection, object_part + RATIO * reflection]), reflection
 
 
+def labelled(values: Floats, **attrs: object) -> xr.DataArray:
+    """Two bands (band, time, y, x) with their coordinates."""
+    coords = {"band": ["8-14", "9.5"], "time": TIME}
+    return xr.DataArray(values, coords, ("band", "time", "y", "x"), attrs=attrs)
+
+
 def picture(scene: Floats, rng: np.random.Generator, *, between: bool = True) -> xr.DataArray:
     """Picture of 8 bit, between the extremes of each frame or of all, with noise of one step."""
     axes = (2, 3) if between else (1, 2, 3)
     low, high = (part(scene, axis=axes, keepdims=True) for part in (np.min, np.max))
     shown = (scene - low) / (high - low) + rng.normal(0, 1 / 255, scene.shape)
-    return xr.DataArray(
-        np.rint(255 * shown) / 255,
-        dims=("band", "time", "y", "x"),
-        coords={"band": ["8-14", "9.5"], "time": TIME},
-    )
-
-
-def still() -> xr.DataArray:
-    """Pixels off the object."""
-    return xr.DataArray(STILL, dims=("y", "x"))
+    return labelled(np.rint(255 * shown) / 255)
 
 
 @pytest.mark.parametrize("walkers", [False, True])
@@ -57,7 +55,7 @@ def test_scale_is_undone(walkers: bool) -> None:
     """Each frame's gain is the true one within 2 %, with people before a third of the wall, too."""
     rng = np.random.default_rng(5)
     truth, _ = scene(rng, walkers=walkers)
-    undone = uncalibrated.unscaled(picture(truth, rng), still())
+    undone = uncalibrated.unscaled(picture(truth, rng), WALL)
     gain = 1 / np.ptp(truth, axis=(2, 3))
     gain /= gain.mean(axis=1, keepdims=True)
     error = undone["gain"].values / gain - 1
@@ -76,7 +74,7 @@ def test_reflection_of_a_scaled_picture() -> None:
     shown = picture(truth, rng)
     with pytest.raises(ValueError, match="pixels have a correlation below"):
         uncalibrated.uncalibrated_reflection(shown)  # for its scale moves all of them together
-    found = uncalibrated.uncalibrated_reflection(uncalibrated.unscaled(shown, still()))
+    found = uncalibrated.uncalibrated_reflection(uncalibrated.unscaled(shown, WALL))
     functions = polynomials(TIME, found.attrs["order"])
     both = found["reflection"].values, reflection
     rapid = [part[:, 20:, :30].reshape(FRAMES, -1) for part in both]
@@ -90,7 +88,7 @@ def test_constant_scale_is_left() -> None:
     """A scale that is the same in all frames explains nothing, and no value is changed."""
     rng = np.random.default_rng(7)
     shown = picture(scene(rng)[0], rng, between=False)
-    undone = uncalibrated.unscaled(shown, still())
+    undone = uncalibrated.unscaled(shown, WALL)
     assert undone.attrs["scale_undone"] == []
     assert max(undone.attrs["scale_explained"]) < 0.5
     np.testing.assert_array_equal(undone, shown)
@@ -130,14 +128,8 @@ def movie(scaling: float = 0.0) -> xr.DataArray:
     for ratio, noise in zip((1.0, RATIO), NOISE, strict=True):
         clean = emission + ratio * pulses()
         gain, offset = scaling * rng.standard_normal((2, FRAMES, 1, 1))
-        noisy = (1 + gain) * clean + offset + noise * rng.standard_normal(clean.shape)
-        bands.append(noisy)
-    return xr.DataArray(
-        np.stack(bands),
-        dims=("band", "time", "y", "x"),
-        coords={"band": ["8-14", "9.5"], "time": TIME},
-        attrs={"units": "1", "radiometric": 0},
-    )
+        bands.append((1 + gain) * clean + offset + noise * rng.standard_normal(clean.shape))
+    return labelled(np.stack(bands), units="1", radiometric=0)
 
 
 @pytest.fixture(scope="module")

@@ -50,14 +50,11 @@ def reader() -> Run:
     return Run("02_reader", {"results": "full"})
 
 
+STEM = "01_calibration"
 READERS: dict[str, Callable[[Path], Any]] = {
-    "01_calibration_response.zarr/counts/c/0": lambda _: reader().open(
-        "01_calibration", "_response"
-    ),
-    "01_calibration/scene.zarr/counts/zarr.json": lambda folder: reader().input(
-        "recorded", folder / "01_calibration"
-    ),
-    "01_calibration.json": lambda _: verify.read_run("full"),
+    f"{STEM}_response.zarr/counts/c/0": lambda _: reader().open(STEM, "_response"),
+    f"{STEM}/scene.zarr/counts/zarr.json": lambda folder: reader().input("recorded", folder / STEM),
+    f"{STEM}.json": lambda _: verify.read_run("full"),
 }
 
 

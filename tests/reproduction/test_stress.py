@@ -110,26 +110,17 @@ def test_ends_of_the_counts() -> None:
     assert float(judged["flagged"]) == 1.0
 
 
-def case(flags: Mapping[str, slice]) -> xr.Dataset:
-    """A case of 200 pixels: ten off, some with flags."""
+def test_validity_shows_what_is_wrong() -> None:
+    """Right, wrong and flagged make up the bar; a pixel with two flags is drawn once."""
     truth = scene(pixels=200)
     result = normal(truth)
     result[OBJECT][:, 0, :10] += 1.0  # K
-    judged = limits.judge(truth, flagged(result, flags)).expand_dims(case=["a case"])
-    return judged.assign_attrs(origin="simulated")
-
-
-def bars(figure: Figure) -> dict[str, float]:
-    """Lengths of the first row's bars [%], by their labels."""
-    parts = [part for part in figure.axes[0].containers if isinstance(part, BarContainer)]
-    return {str(part.get_label()): float(part.patches[0].get_width()) for part in parts}
-
-
-def test_validity_shows_what_is_wrong() -> None:
-    """Right, wrong and flagged make up the bar; a pixel with two flags is drawn once."""
-    figure = validity(case({"gray": slice(8, 40), "saturated": slice(20, 60)}))
+    result = flagged(result, {"gray": slice(8, 40), "saturated": slice(20, 60)})
+    judged = limits.judge(truth, result).expand_dims(case=["a case"])
+    figure = validity(judged.assign_attrs(origin="simulated"))
     figure.draw_without_rendering()
-    lengths = bars(figure)
+    parts = [part for part in figure.axes[0].containers if isinstance(part, BarContainer)]
+    lengths = {str(part.get_label()): float(part.patches[0].get_width()) for part in parts}
     wrong = next(label for label in lengths if "wrong" in label)
     assert lengths[wrong] == pytest.approx(4.0)  # %: eight of 200
     assert lengths["no flag and right"] == pytest.approx(70.0)

@@ -142,7 +142,7 @@ def test_the_index_writes_the_strokes() -> None:
 def test_pacing_keeps_its_pace() -> None:
     """Between the corners of the way the pace lies in its range, and pauses are pauses."""
     corners, rng = ((-2.0, 0.0), (0.0, 0.0), (2.0, 1.0)), np.random.default_rng(1)
-    route = pacing(corners, clock(), rng, pace=(0.5, 1.0))
+    route = pacing(corners, clock(), rng)
     lengths = np.linalg.norm(np.diff(route.places, axis=0), axis=1)
     speeds = lengths / np.diff(route.times)
     np.testing.assert_array_equal(speeds[::2], 0.0)

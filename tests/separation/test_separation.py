@@ -16,8 +16,8 @@ from dbthermal.schema import Status
 from dbthermal.simulation import Background, Rig
 from reproduction import methods
 from reproduction.experiments import cases
+from reproduction.experiments.twins import reflected_change
 from reproduction.methods.dbvt import DbvtSettings
-from reproduction.metrics import reflected_change
 
 RIG = Rig()
 TIME = np.arange(350) / 10.0

@@ -2,10 +2,12 @@
 
 On the bench an object is heated in steps and reflects, like a mirror, a blackbody set to several
 temperatures; a thermocouple sits beside the reflection. By the reflector method the same heated
-object and a crumpled foil are recorded in the room. Both are simulated with their typical errors.
+object and a crumpled foil are recorded in the room. Both are simulated with their typical errors,
+and compared over many series.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Final
 
@@ -111,29 +113,10 @@ def bench_series(
 
     The noise of the response is that of one pixel and frame: it stands for the drift of the camera
     between shutter events, which no mean over pixels removes. Common errors are drawn once.
-
-    Examples
-    --------
-    The emissivity of a chrome ball, 0.10, from a series with all errors of the bench:
-
-    >>> from dbthermal import calibration, simulation
-    >>> bench, ball = Bench(), OBJECTS[0]
-    >>> response, rng = simulation.Rig().response(), np.random.default_rng(1)
-    >>> series = bench_series(response, ball, bench, rng)
-    >>> stds = (bench.reading_std, bench.blackbody_std)  # K
-    >>> fitted = calibration.fit_emissivity(series, response, stds, bench.bias(ball))
-    >>> fitted["emissivity"].values.round(2).tolist()
-    [0.1, 0.1]
     """
-    warm, cold = (
-        grid.ravel()
-        for grid in np.meshgrid(bench.object_temperatures, bench.blackbody_temperatures)
-    )
-    stray = rng.uniform(0.0, sample.stray)
-    room = _blackbody(response, np.full_like(cold, bench.air_temperature))
-    reflected = (1.0 - stray) * _blackbody(response, cold) + stray * room
-    share = band_emissivity(sample, _names(response)).values[:, np.newaxis]
-    counts = mixing.leaving(share, _blackbody(response, warm), reflected)
+    grids = np.meshgrid(bench.object_temperatures, bench.blackbody_temperatures)
+    warm, cold = (grid.ravel() for grid in grids)
+    counts = _counts(response, sample, bench, warm, cold, rng.uniform(0.0, sample.stray))
     shown = cold + rng.uniform(-1, 1) * bench.blackbody_tolerance
     read = {
         "object_temperature": _thermocouple(warm, bench, rng),
@@ -152,19 +135,6 @@ def reflector_series(
     reflection all but the stray part is mirror-like, of a temperature higher by
     `Bench.mirrored_excess`. Parameters are those of `bench_series`. Raises a ValueError if no step
     of the object is `Bench.least_excess` above the air.
-
-    Examples
-    --------
-    A chrome ball of emissivity 0.10 seems to have 0.3, for it reflects what the foil does not:
-
-    >>> from dbthermal import calibration, simulation
-    >>> bench, ball = Bench(), OBJECTS[0]
-    >>> response, rng = simulation.Rig().response(), np.random.default_rng(1)
-    >>> series = reflector_series(response, ball, bench, rng)
-    >>> stds = (bench.reading_std, bench.foil_std)  # K
-    >>> fitted = calibration.reflector_emissivity(series, response, stds, bench.bias(ball))
-    >>> fitted["emissivity"].values.round(1).tolist()
-    [0.3, 0.3]
     """
     steps = np.array(bench.object_temperatures)
     warm = steps[steps >= bench.air_temperature + bench.least_excess]
@@ -174,11 +144,8 @@ def reflector_series(
             f"{bench.least_excess} K above the air's {bench.air_temperature} K."
         )
     air = np.full_like(warm, bench.air_temperature)
-    stray = rng.uniform(0.0, sample.stray)
-    mirrored = _blackbody(response, air + rng.uniform(*bench.mirrored_excess))
-    reflected = (1.0 - stray) * mirrored + stray * _blackbody(response, air)
-    share = band_emissivity(sample, _names(response)).values[:, np.newaxis]
-    counts = mixing.leaving(share, _blackbody(response, warm), reflected)
+    stray, mirrored = rng.uniform(0.0, sample.stray), air + rng.uniform(*bench.mirrored_excess)
+    counts = _counts(response, sample, bench, warm, mirrored, stray)
     uneven = _blackbody(response, air + rng.normal(0, bench.foil_std, air.size))
     emitted = _blackbody(response, air + bench.foil_warming * (warm - air))
     foil = mixing.leaving(bench.foil_emissivity, emitted, uneven)
@@ -193,6 +160,16 @@ def reflector_series(
 def _blackbody(response: xr.Dataset, temperature: Array) -> Array:
     """Counts of a blackbody (band, measurement), the temperatures checked against the response."""
     return responses.counts(response, xr.DataArray(temperature, dims="measurement")).values
+
+
+def _counts(
+    response: xr.Dataset, sample: Sample, bench: Bench, warm: Array, mirrored: Array, stray: float
+) -> Array:
+    """Counts (band, measurement) of a warm mirror, of whose reflection a share is of the room."""
+    room = _blackbody(response, np.full_like(warm, bench.air_temperature))
+    reflected = (1.0 - stray) * _blackbody(response, mirrored) + stray * room
+    share = band_emissivity(sample, _names(response)).values[:, np.newaxis]
+    return mixing.leaving(share, _blackbody(response, warm), reflected)
 
 
 def _noisy(response: xr.Dataset, counts: Array, rng: np.random.Generator) -> Array:
@@ -242,3 +219,100 @@ def contact_measurements(
     for (name, level), std in zip(true.items(), stds, strict=True):
         read[name] = level + rng.normal(0, std, len(level))
     return _series(response, "contact", read)
+
+
+PROCEDURES: Final = ("bench", "bench, plain fit", "reflector")
+"""Procedures that `compare_procedures` compares: the paper's bench with the common errors in the
+fit, and without as the paper's equation has it; and the reflector method, which is told the
+thermocouple's. ("Method" is a word of xarray's own.)"""
+
+
+def compare_procedures(
+    response: xr.Dataset, rng: np.random.Generator, *, repeats: int = 100
+) -> xr.Dataset:
+    """Statistics of many measurements of objects on the bench and by the reflector method.
+
+    A series' common errors are drawn anew for each of two or more repeats. `true` (object, band);
+    over (object, procedure, band): `mean` of the estimates, their standard deviation `spread`,
+    their `largest` error, and `coverage`, the share of errors within the stated deviation, 0.68 for
+    a calibrated uncertainty [1].
+    """
+    true, bench = _true(response, repeats), Bench()
+    estimates = np.array(
+        [[_measured(response, sample, bench, rng) for _ in range(repeats)] for sample in OBJECTS]
+    )  # (object, repeat, value or deviation, procedure, band)
+    value, std = estimates[:, :, 0], estimates[:, :, 1]
+    error = value - true.values[:, np.newaxis, np.newaxis]
+    statistics = {
+        "mean": value.mean(axis=1),
+        "spread": value.std(axis=1, ddof=1),
+        "largest": np.abs(error).max(axis=1),
+        "coverage": np.mean(np.abs(error) < std, axis=1),
+    }
+    dims, unit = ("object", "procedure", "band"), {"units": "1"}
+    return xr.Dataset(
+        {"true": true, **{name: (dims, statistic, unit) for name, statistic in statistics.items()}},
+        coords={"procedure": list(PROCEDURES)},
+        attrs={"origin": "simulated twin", "repeats": repeats},
+    )
+
+
+def reflector_sensitivity(
+    response: xr.Dataset,
+    rng: np.random.Generator,
+    excesses: Sequence[float] = (0.0, 5.0, 11.0),
+    repeats: int = 100,
+) -> xr.Dataset:
+    """Emissivity by the reflector method over the excess of the reflected direction over the room.
+
+    The excesses [K] are the largest of a smooth object's reflection; a series' own is drawn evenly
+    from 0. `mean` of the estimates (object, excess, band), `true` (object, band) [1]. With 0 K the
+    foil gives what the object reflects, and the method is right; beyond, its error is the
+    emissivity's share in the excess, whatever the foil.
+    """
+    true = _true(response, repeats)
+    benches = [replace(Bench(), mirrored_excess=(0.0, float(excess))) for excess in excesses]
+    runs = [
+        [[_by_reflector(response, it, bench, rng)[0] for _ in range(repeats)] for bench in benches]
+        for it in OBJECTS
+    ]
+    mean = np.mean(runs, axis=2)
+    return xr.Dataset(
+        {"true": true, "mean": (("object", "excess", "band"), mean, {"units": "1"})},
+        coords={"excess": ("excess", [float(excess) for excess in excesses], {"units": "K"})},
+        attrs={"origin": "simulated twin", "repeats": repeats},
+    )
+
+
+def _true(response: xr.Dataset, repeats: int) -> xr.DataArray:
+    """True emissivity (object, band) of the objects."""
+    if repeats < 2:
+        rule = "Must be twice or more"
+        raise ValueError(f"Invalid comparison of {len(OBJECTS)} samples, {repeats} times. {rule}.")
+    names = _names(response)
+    return xr.DataArray(
+        [band_emissivity(sample, names).values for sample in OBJECTS],
+        coords={"object": [sample.name for sample in OBJECTS], "band": list(names)},
+        attrs={"units": "1"},
+    )
+
+
+def _by_reflector(
+    response: xr.Dataset, sample: Sample, bench: Bench, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Emissivity (band,) of one series by the reflector method, and its deviation."""
+    series = reflector_series(response, sample, bench, rng)
+    stds = (bench.reading_std, bench.foil_std)
+    estimates = calibration.reflector_emissivity(series, response, stds, bench.bias(sample))
+    return estimates["emissivity"].values, estimates["emissivity_std"].values
+
+
+def _measured(
+    response: xr.Dataset, sample: Sample, bench: Bench, rng: np.random.Generator
+) -> Array:
+    """Emissivity and its deviation by every procedure, (2, procedure, band)."""
+    bias, stds = bench.bias(sample), (bench.reading_std, bench.blackbody_std)
+    series = bench_series(response, sample, bench, rng)
+    fits = [calibration.fit_emissivity(series, response, stds, *biases) for biases in ((bias,), ())]
+    estimates = [(fit["emissivity"].values, fit["emissivity_std"].values) for fit in fits]
+    return np.stack([*estimates, _by_reflector(response, sample, bench, rng)], axis=1)

@@ -116,10 +116,7 @@ def medians(comparison: xr.Dataset, default: str = "subspace") -> xr.Dataset:
         median = worst.median(over)
         variables[name] = median.where(np.isfinite(median)).assign_attrs(comparison[name].attrs)
     off = ~(comparison["emissivity_error"].max("band", skipna=False) <= WRONG)
-    shares = {
-        "wrong": off.where(counted).mean(over),
-        "solved": solved.mean(over),
-    }
+    shares = {"wrong": off.where(counted).mean(over), "solved": solved.mean(over)}
     variables |= {name: share.assign_attrs(units="1") for name, share in shares.items()}
     return xr.Dataset(variables, attrs=comparison.attrs)
 

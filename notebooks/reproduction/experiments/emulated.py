@@ -7,6 +7,7 @@ thermometers of `Bench` err, its samples are heated. Everything here is simulate
 
 import shutil
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -54,34 +55,34 @@ class Views:
         are the rows and columns of each material, elsewhere is the blackbody itself.
         """
         looks, shape = {}, (self.detector.sizes["y"], self.detector.sizes["x"])
-        for band, curve in self._curves().items():
+        for band in self.rig.bands:
+            curve = responses.curve(self.response, band)
             values = {name: float(emissivity.sel(material=name, band=band)) for name in places}
             looks[band] = _bench(world, curve, values, places, shape)
         return self._pictures(looks)
 
     def movie(self, scene: xr.Dataset) -> dict[str, Picture]:
         """Frames, by band, of an evenly sampled scene from time 0 on, linear between its frames."""
-        curves = self._curves()
-        names = [str(name) for name in scene["band"].values]
-        return self._pictures({name: _shown(scene, curves[name], name) for name in names})
-
-    def _curves(self) -> dict[str, Curve]:
-        return {band: responses.curve(self.response, band) for band in self.rig.bands}
+        names, curve = scene["band"].values.tolist(), partial(responses.curve, self.response)
+        looks = {name: _shown(scene, curve(name), name) for name in names}
+        return self._pictures(looks)
 
     def _pictures(self, looks: Mapping[str, Look]) -> dict[str, Picture]:
-        return {band: self._picture(band, look) for band, look in looks.items()}
+        """Counts of each view with noise, fixed pattern and 16 bits."""
+        pictures: dict[str, Picture] = {}
+        for band, look in looks.items():
+            rng = np.random.default_rng(self._noise.spawn(1)[0])
+            noise, detector = self.response["noise"].sel(band=band), self.detector.sel(band=band)
+            pictures[band] = partial(_taken, look, float(noise), detector, rng)
+        return pictures
 
-    def _picture(self, band: str, look: Look) -> Picture:
-        """Counts of a view with noise, fixed pattern and 16 bits."""
-        rng = np.random.default_rng(self._noise.spawn(1)[0])
-        noise = float(self.response["noise"].sel(band=band))
-        detector = self.detector.sel(band=band)
 
-        def picture(time: float) -> Counts:
-            clean = look(time)
-            return digitise(clean + rng.normal(0.0, noise, clean.shape), detector)
-
-        return picture
+def _taken(
+    look: Look, noise: float, detector: xr.Dataset, rng: np.random.Generator, time: float
+) -> Counts:
+    """Frame of a view at a time [s]."""
+    clean = look(time)
+    return digitise(clean + rng.normal(0.0, noise, clean.shape), detector)
 
 
 def _bench(
@@ -228,9 +229,8 @@ class Bench(World):
     def step(self, temperature: float) -> None:
         """Set the blackbody [K], and heat every sample to a temperature of its own."""
         self.blackbody_temperature = temperature
-        self._temperatures = {
-            name: float(self._rng.uniform(*ends)) for name, ends in self._samples.items()
-        }
+        samples = self._samples.items()
+        self._temperatures = {name: float(self._rng.uniform(*ends)) for name, ends in samples}
 
     def thermocouple_temperature(self, channel: int) -> float:
         """Temperature of one thermocouple's tip with the error of one reading [K]; NaN if open."""
@@ -239,8 +239,6 @@ class Bench(World):
             return super().thermocouple_temperature(channel) + std * float(self._rng.normal())
 
     def _warmth(self, time: float) -> Mapping[str, float]:
-        touched = {
-            name: float(np.interp(time, course["time"], course))
-            for name, course in self._touched.items()
-        }
+        courses = self._touched.items()
+        touched = {name: float(np.interp(time, it["time"], it)) for name, it in courses}
         return {**self._temperatures, **touched}

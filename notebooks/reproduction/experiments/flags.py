@@ -151,14 +151,11 @@ def _pictured(
     if flag == Status.BANDS_APART.label:
         moving = drawn["background_temperature"].std("time").max("band") > _MOVING
         return drawn, separation.solve(capture, response), moving.values
-    field = xr.Dataset(
-        {
-            "shift": (("axis", "y", "x"), shift, {"units": "pixel"}),
-            "shift_std": (("axis", "y", "x"), np.full(shift.shape, _KNOWN), {"units": "pixel"}),
-            "known": (("y", "x"), np.ones(_SHAPE, dtype=bool), {"units": "1"}),
-        },
-        {"axis": ["y", "x"], "y": capture["y"], "x": capture["x"]},
-    )
+    dims, units = ("axis", "y", "x"), {"units": "pixel"}
+    coords = {"axis": ["y", "x"], "y": capture["y"], "x": capture["x"]}
+    field = xr.Dataset({"shift": (dims, shift, units)}, coords)
+    field["shift_std"] = (dims, np.full(shift.shape, _KNOWN), units)
+    field["known"] = (dims[1:], np.ones(_SHAPE, dtype=bool), {"units": "1"})
     result = separation.solve(capture, response, reflection_shift=field)
     return drawn, result, _unpaired(shift)
 

@@ -82,9 +82,9 @@ def near_bound(
     solved = result["object_temperature"].notnull().all("time")
     response = rig.response()
     free = limits.bounds(truth, response, resting=False, emissivity_std=BEFOREHAND)
-    slope = limits.bounds(
-        truth, _as_line(response, rig), resting=False, response_kind="linear"
-    ).assign(object_temperature_std=np.nan * free["object_temperature_std"])
+    line = _as_line(response, rig)
+    slope = limits.bounds(truth, line, resting=False, response_kind="linear")
+    slope = slope.assign(object_temperature_std=np.nan * free["object_temperature_std"])
     names, kinds = [f"{it}_std" for it in _BOUNDED], (free, slope, limits.bounds(truth, response))
     bound = gridded([kind[names] for kind in kinds], {"knowing": KNOWING})
     second = (1.0 - truth["emissivity"]) / (1.0 - truth["emissivity"].isel(band=0))
@@ -96,9 +96,8 @@ def near_bound(
         "object_temperature_bound": (bound["object_temperature_std"] ** 2).mean("time") ** 0.5,
     }
     flat = {name: _row(values.where(solved), name) for name, values in measured.items()}
-    return xr.Dataset(flat | {"status": _row(result["status"], "status")}).assign_attrs(
-        origin="simulated", seed=seed
-    )
+    flat["status"] = _row(result["status"], "status")
+    return xr.Dataset(flat, attrs={"origin": "simulated", "seed": seed})
 
 
 def summary(measured: xr.Dataset) -> xr.Dataset:
@@ -109,18 +108,13 @@ def summary(measured: xr.Dataset) -> xr.Dataset:
     `scatter` (knowing) [1], standard deviation over the pixels of the ratio's error over its bound;
     `excess` (knowing) [1], the object's error over its bound.
     """
-    figures = {
-        name: _rms(measured[name])
-        for name in (f"{quantity}_{which}" for quantity in _BOUNDED for which in ("error", "bound"))
-    }
-    shares = {
-        "scatter": (measured["reflection_ratio_error"] / measured["reflection_ratio_bound"]).std(
-            "pixel"
-        ),
-        "excess": figures["object_temperature_error"] / figures["object_temperature_bound"],
-    }
-    shares = {name: values.assign_attrs(units="1") for name, values in shares.items()}
-    return xr.Dataset(figures | shares, attrs=measured.attrs)
+    names = [f"{quantity}_{which}" for quantity in _BOUNDED for which in ("error", "bound")]
+    figures = {name: _rms(measured[name]) for name in names}
+    ratio = measured["reflection_ratio_error"] / measured["reflection_ratio_bound"]
+    excess = figures["object_temperature_error"] / figures["object_temperature_bound"]
+    for name, values in {"scatter": ratio.std("pixel"), "excess": excess}.items():
+        figures[name] = values.assign_attrs(units="1")
+    return xr.Dataset(figures, attrs=measured.attrs)
 
 
 def pooled(
@@ -149,15 +143,15 @@ def pooled(
     rig, case = Rig(), {"emissivity": list(emissivity), "start": ends[0], "stop": ends[1]}
     time = np.arange(int(clock[0])) / clock[1]
     truth, capture, response = cases.simulate(case, rig, time, pixels, seed)
-    linear = _as_line(response, rig)
-    bound = limits.bounds(truth, linear, resting=False, response_kind="linear")
+    line = _as_line(response, rig)
+    bound = limits.bounds(truth, line, resting=False, response_kind="linear")
     single = _rms(_row(bound["reflection_ratio_std"].isel(band=1), "reflection_ratio"))
     ratio, errors = cases.reflection_ratio(list(emissivity)).item(), []
     for size in sizes:
         labels = xr.DataArray(np.arange(pixels)[np.newaxis] // size, dims=("y", "x"))
         result = separation.solve(capture, response, pool=None if size == 1 else labels)
-        errors.append(_of_groups(size, truth, result, ratio))
-        errors[-1]["reflection_ratio_bound"] = (single / np.sqrt(size)).assign_attrs(units="1")
+        lowest = (single / np.sqrt(size)).assign_attrs(units="1")
+        errors.append(_of_groups(size, truth, result, ratio).assign(reflection_ratio_bound=lowest))
     groups = gridded(errors, {"size": sizes})
     return groups.drop_vars("band", errors="ignore").assign_attrs(origin="simulated")
 
@@ -174,9 +168,8 @@ def _of_groups(size: int, truth: xr.Dataset, result: xr.Dataset, ratio: float) -
         for name, values in of_groups.items()
     }
     error = result["object_temperature"] - truth["object_temperature"]
-    measured["object_temperature_error"] = _rms(error.stack(pixel=error.dims)).assign_attrs(
-        units="K"
-    )
+    rms = _rms(error.stack(pixel=error.dims))
+    measured["object_temperature_error"] = rms.assign_attrs(units="K")
     return xr.Dataset(measured)
 
 
@@ -256,19 +249,14 @@ def judge(truth: xr.Dataset, result: xr.Dataset) -> xr.Dataset:
     over the frames, and bad in `any` where that is so or the error of an emissivity exceeds four
     of its standard deviations. A pixel without a value is not bad.
 
-    Returns
-    -------
-    Dataset
-        Over all pixels, in [1] but for the error in [K]; NaN where there is nothing to count:
-
-        - `object_coverage` (among): share of samples whose 95 % interval holds the truth;
-          `emissivity_coverage` (among, band): share of pixels;
-        - `width` (band): stated standard deviation of the emissivity over the robust standard
-          deviation of its error, both of all pixels with a value; 1 for a calibrated uncertainty;
-        - `object_temperature_rmse` [K] and `emissivity_error` (band), see `cases.score`;
-        - `flagged`: share of pixels with any flag;
-        - `bad_pixels` (kind): their number; `bad_flagged` (kind): share of them with a flag;
-        - `status` (pixel), and `bad` (kind, pixel), true where bad.
+    Over all pixels, in [1] but for the error in [K], NaN where there is nothing to count:
+    `object_coverage` (among), share of samples whose 95 % interval holds the truth;
+    `emissivity_coverage` (among, band), share of pixels; `width` (band), stated standard deviation
+    of the emissivity over the robust standard deviation of its error, both of all pixels with a
+    value, 1 for a calibrated uncertainty; `object_temperature_rmse` [K] and `emissivity_error`
+    (band), see `cases.score`; `flagged`, share of pixels with any flag; `bad_pixels` (kind), their
+    number; `bad_flagged` (kind), share of them with a flag; `status` (pixel), and `bad` (kind,
+    pixel), true where bad.
     """
     statistics = _coverage(truth, result)
     # Pixels (kind, pixel) with an error beyond four standard deviations.
@@ -305,11 +293,10 @@ def _coverage(truth: xr.Dataset, result: xr.Dataset) -> dict[str, xr.DataArray]:
     label = xr.DataArray(list(AMONG), dims="among", coords={"among": list(AMONG)})
     chosen = (result["status"] == 0) | (label == "all")
     statistics = {}
-    for name, over in (("object", ("time", *_PIXELS)), ("emissivity", _PIXELS)):
-        full = "object_temperature" if name == "object" else name
-        error, std = abs(result[full] - truth[full]), result[f"{full}_std"]
-        counted = error.notnull() & chosen
-        statistics[f"{name}_coverage"] = _share(error < cases.INTERVAL * std, counted, over)
+    for name, over in {"object_temperature": ("time", *_PIXELS), "emissivity": _PIXELS}.items():
+        error, key = abs(result[name] - truth[name]), name.removesuffix("_temperature")
+        within = error < cases.INTERVAL * result[f"{name}_std"]
+        statistics[f"{key}_coverage"] = _share(within, error.notnull() & chosen, over)
     return statistics
 
 

@@ -8,6 +8,7 @@ from typing import Any, Final
 import numpy as np
 import xarray as xr
 
+from dbthermal import _text as texts
 from dbthermal import alignment, separation, simulation
 from dbthermal.correction import mark_shutter
 from dbthermal.simulation import Background, Rig
@@ -53,8 +54,7 @@ class Pixels:
         count, rate = int(self.clock[0]), self.clock[1]
         time = np.arange((count - 1) * steps + 1 + later) / (rate * steps)
         value = xr.DataArray(list(self.emissivity), dims="band", coords={"band": list(Rig().bands)})
-        background = Background(**self.background)
-        start, stop = self.ends
+        background, (start, stop) = Background(**self.background), self.ends
         return simulation.independent_pixels(
             time, value, background, self.pixels, rng, start=start, stop=stop
         )
@@ -91,8 +91,7 @@ def disturbed(
     cameras' shutters close at `shutter`, times as shares of the capture [1]. `pixels` are fields of
     `Pixels`. Over `treatment`, the variables of `cost`.
     """
-    if name not in NUISANCES:
-        raise ValueError(f"Unknown nuisance '{name}'. Must be one of {NUISANCES}.")
+    texts.check_listed("Unknown nuisance", name, NUISANCES)
     kind, rng = Pixels(**pixels), np.random.default_rng(seed)
     scene, response = kind.scene(rng), Rig().response()
     capture = simulation.observe(scene, response, rng)
@@ -182,10 +181,8 @@ def _compare(
 
 def _view(wide: xr.Dataset, shift: Sequence[float]) -> xr.Dataset:
     """Part of a wide scene within its margin, so far to the right and down [pixel]."""
-    right, down = (
-        round((_MARGIN + moved) * n) for moved, n in zip(shift, (COLUMNS, 1), strict=True)
-    )
-    width, height = (wide.sizes["x"] - 2 * _MARGIN * COLUMNS), wide.sizes["y"] - 2 * _MARGIN
+    right, down = round((_MARGIN + shift[0]) * COLUMNS), round(_MARGIN + shift[1])
+    width, height = wide.sizes["x"] - 2 * _MARGIN * COLUMNS, wide.sizes["y"] - 2 * _MARGIN
     seen = wide.isel(x=slice(right, right + width), y=slice(down, down + height))
     mean = seen.coarsen(x=COLUMNS).mean()
     places = {dim: np.arange(mean.sizes[dim]) for dim in ("x", "y")}

@@ -114,6 +114,10 @@ def newton_gradient(search: Search, column: int) -> tuple[Array, ...]:
     return values, *(2 / films.shape[1] * gradient for gradient in gradients)
 
 
+def _tensors(search: Search) -> list[Any]:
+    return [torch.tensor(data, requires_grad=True) for data in (search.films, search.scalars)]
+
+
 def disagreements(search: Search, rng: np.random.Generator) -> xr.DataArray:
     """Relative differences [1] of losses and gradient from torch's (quantity, pixel).
 
@@ -121,9 +125,7 @@ def disagreements(search: Search, rng: np.random.Generator) -> xr.DataArray:
     """
     search = copy.deepcopy(search)
     search.films += rng.standard_normal(search.films.shape) * np.array([[1.0], [0.1], [0.1]])
-    films, scalars = (
-        torch.tensor(data, requires_grad=True) for data in (search.films, search.scalars)
-    )
+    films, scalars = _tensors(search)
     total = losses(films, scalars, search)
     gradient = (data.numpy() for data in torch.autograd.grad(total.sum(), (films, scalars)))
     rows = []
@@ -150,9 +152,7 @@ def newton(start: Search, truth: xr.DataArray) -> tuple[Search, xr.Dataset]:
 
 def adam(start: Search, truth: xr.DataArray, rate: float, looks: Sequence[int]) -> xr.Dataset:
     """What is `judged` at some steps of Adam of a rate [K, and 1 of emissivities]."""
-    films, scalars = (
-        torch.tensor(data, requires_grad=True) for data in (start.films, start.scalars)
-    )
+    films, scalars = _tensors(start)
     descent, began, points = torch.optim.Adam([films, scalars], lr=rate), time.process_time(), []
     for number in range(1, max(looks) + 1):
         descent.zero_grad()

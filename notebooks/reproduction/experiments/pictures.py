@@ -81,18 +81,16 @@ class Picture:
         """Function of rows and columns (y, x) [pixel] to what they mirror (time, y, x) [K]."""
         height, width = self.shape
         span = time[-1] - time[0]
-        starts = time[0] + span * (np.arange(self.walkers) + rng.random(self.walkers)) / (
-            self.walkers
-        )
+        places = np.arange(self.walkers) + rng.random(self.walkers)
+        starts = time[0] + span * places / self.walkers
         people = []
         for start in starts:
             direction, crossing = rng.choice([-1.0, 1.0]), rng.uniform(1.5, 5.0)  # [s]
             half = width * rng.uniform(0.06, 0.2)
             reach = width / 2.0 + 2.0 * half
             x = width / 2.0 + direction * reach * (2.0 * (time - start) / crossing)
-            y = height * rng.uniform(0.35, 0.75) + 0.03 * height * np.sin(
-                2.0 * np.pi * (time - start) / 0.5
-            )
+            steps = np.sin(2.0 * np.pi * (time - start) / 0.5)
+            y = height * rng.uniform(0.35, 0.75) + 0.03 * height * steps
             people.append((x, y, half, height * rng.uniform(0.25, 0.6), rng.uniform(*self.warmer)))
         edge = self.still * width
 

@@ -154,16 +154,12 @@ def scores(
     usable = ~schema.has_flag(whole["status"], "dead_pixel", "invalid_samples")
     value = whole[name].where(usable)
     sampled = scene.corrected["counts"].notnull().all("band") & usable  # that both cameras have
-    shares = {
-        "good_pixels": good.mean(),
-        "whole_finite": value.where(sampled).notnull().sum() / sampled.sum(),
-    }
+    finite = value.where(sampled).notnull().sum() / sampled.sum()
+    shares = {"good_pixels": good.mean(), "whole_finite": finite}
     if scene.truth is None or calibrated is None:
         return {name: float(share) for name, share in shares.items()}
     # Errors of the object, and intervals by the noise alone.
-    noise, noise_of_whole = (
-        separation.without_calibration(result) for result in (per_pixel, whole)
-    )
+    noise, noise_of_whole = map(separation.without_calibration, (per_pixel, whole))
     error = (per_pixel[name] - scene.truth[name]).where(good)
     of_known = (calibrated[name] - scene.truth[name]).where(good)
     of_whole = value - scene.truth[name]

@@ -1,21 +1,22 @@
 """A simulated twin judged as the paper judges a scene: at its thermocouples."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
 import xarray as xr
 from scipy.constants import zero_Celsius
 
-from dbthermal import alignment, calibration, emissivity, separation, simulation
+from dbthermal import alignment, calibration, emissivity, schema, separation, simulation
 from dbthermal import response as responses
-from dbthermal.schema import COMPLETED
+from dbthermal._coordinates import laid_on
 from reproduction import methods, twins
 from reproduction.experiments.bench import Bench, Sample, bench_series
 from reproduction.experiments.cases import held, rmse, scalars
 from reproduction.experiments.comparison import EVERY, MOVING, arguments
-from reproduction.metrics import relative_error_celsius
-from reproduction.twins.stage import Registration
+from reproduction.twins import stage
+from reproduction.twins.stage import Capture, Registration
 
 BEAD: Final = 3  # pixels along a side of the square that a thermocouple's bead covers
 
@@ -38,7 +39,7 @@ def judge_twin(
     variants: Mapping[str, Mapping[str, Any]],
     *,
     material: str,
-    capture: twins.Capture,
+    capture: Capture,
     registrations: Sequence[Registration] = ("perfect",),
     whole: bool = True,
     shown: bool = False,
@@ -46,7 +47,7 @@ def judge_twin(
     """Simulate a twin, calibrate its emissivity on the bench, and judge it at its thermocouple.
 
     One of `twins.TWINS`, of a material of `emissivity.embedded_table`, by two cameras a baseline
-    apart, whose views are registered in some ways (`twins.registered`), and by two at the first
+    apart, whose views are registered in some ways (`stage.registered`), and by two at the first
     one's place. Of the variants (see `at_thermocouple`), "calibrated" gets the emissivities that
     the bench finds for a piece of the same material, with their deviations.
 
@@ -68,8 +69,8 @@ def judge_twin(
     }
     views = {"one place": simulation.observe(scene, response, rng)}
     if capture.baseline:
-        apart = twins.observe(scene, response, rng)
-        views = {how: twins.registered(scene, apart, how) for how in registrations} | views
+        apart = stage.observe(scene, response, rng)
+        views = {how: stage.registered(scene, apart, how) for how in registrations} | views
     scores, picture = [], None
     for cameras, corrected in views.items():
         shift = alignment.reflection_shift(corrected, response) if cameras != "one place" else None
@@ -98,7 +99,7 @@ def judge_twin(
 
 def capture_of(
     material: str, shape: Sequence[int], clock: Sequence[float], baseline: float
-) -> twins.Capture:
+) -> Capture:
     """Capture of a twin of a material, in the bands of the default rig.
 
     Of rows and columns, a number of frames and their rate [Hz], by cameras a baseline apart [m].
@@ -106,10 +107,10 @@ def capture_of(
     table = emissivity.embedded_table()["emissivity"]
     true = table.sel(material=material, band=list(simulation.Rig().bands), drop=True)
     time = np.arange(int(clock[0])) / clock[1]
-    return twins.Capture(true, (shape[0], shape[1]), time, baseline)
+    return Capture(true, (shape[0], shape[1]), time, baseline)
 
 
-def separate_twin(name: str, seed: int, capture: twins.Capture, **options: Any) -> xr.Dataset:
+def separate_twin(name: str, seed: int, capture: Capture, **options: Any) -> xr.Dataset:
     """Separate a twin, seen by the default rig, by the default way; options of `twins.twin`.
 
     Returns the result of `separation.separate`, and in addition `apparent_temperature`
@@ -118,7 +119,7 @@ def separate_twin(name: str, seed: int, capture: twins.Capture, **options: Any) 
     """
     rng, response = np.random.default_rng(seed), simulation.Rig().response()
     scene = twins.twin(name, capture, rng, **options)
-    corrected = twins.registered(scene, twins.observe(scene, response, rng))
+    corrected = stage.registered(scene, stage.observe(scene, response, rng))
     shift = alignment.reflection_shift(corrected, response) if capture.baseline else None
     whole = separation.separate(corrected, response, reflection_shift=shift)
     return _with_truth(whole, scene, corrected, response)
@@ -129,10 +130,8 @@ def _with_truth(
 ) -> xr.Dataset:
     """Result with the inputs and the truth beside it, see `separate_twin`."""
     seen = responses.apparent_temperature(response, corrected["counts"])
-    films = {
-        f"true_{layer}_temperature": scene[f"{layer}_temperature"]
-        for layer in ("object", "background")
-    }
+    names = ("object_temperature", "background_temperature")
+    films = {f"true_{name}": scene[name] for name in names}
     films["apparent_temperature"] = seen.assign_attrs(scene.attrs)
     films = {name: film.astype("float32") for name, film in films.items()}
     return separated.assign(films).assign_attrs(corrected.attrs)
@@ -153,7 +152,7 @@ def over_the_image(
     of samples whose 95 % interval holds the truth.
     """
     moving, status = _moving(scene), separated["status"]
-    good = moving & ((status & int(COMPLETED)) != 0 if completed else status == 0)
+    good = moving & ((status & int(schema.COMPLETED)) != 0 if completed else status == 0)
     error = (separated["object_temperature"] - scene["object_temperature"]).where(good)
     return scalars(
         good=good.sum() / moving.sum(),
@@ -185,7 +184,7 @@ def at_thermocouple(
     """Errors of several methods at the first thermocouple of a twin.
 
     The estimate is the mean over the pixels that the bead covers. The reading has the errors of a
-    probe that was compared with a reference (`twins.thermocouple_readings`), drawn anew for a
+    probe that was compared with a reference (`stage.thermocouple_readings`), drawn anew for a
     number of probes, so that the result does not depend on one probe's error. Variants are label ->
     `method` of `methods.METHODS` and arguments of `solve`, with the shift of the reflections
     where it takes one; the default method without arguments is what has been separated. A method
@@ -200,10 +199,8 @@ def at_thermocouple(
     reach = BEAD // 2
     centre = {dim: int(scene[f"thermocouple_{dim}"][0]) for dim in ("y", "x")}
     square = {dim: slice(place - reach, place + reach + 1) for dim, place in centre.items()}
-    readings = [
-        twins.thermocouple_readings(scene, rng, bead=BEAD).isel(thermocouple=0)
-        for _ in range(probes)
-    ]
+    read = partial(stage.thermocouple_readings, scene, rng, bead=BEAD)
+    readings = [read().isel(thermocouple=0) for _ in range(probes)]
     seed = int(rng.integers(2**32))  # of random starts: each capture has its own
     bead = separated["object_temperature"].isel(square).mean(("y", "x"), skipna=False)
     estimates = [
@@ -276,3 +273,46 @@ def share(estimate: xr.DataArray, cause: xr.DataArray) -> float:
     if not power > 0:
         raise ValueError("Invalid cause without change where anything was estimated. Must change.")
     return float((a * b).sum()) / power
+
+
+def relative_error_celsius(estimate: xr.DataArray, truth: xr.DataArray) -> xr.DataArray:
+    r"""Error in per cent of the true temperature in degrees Celsius, as the paper reports it.
+
+    .. math:: 100 \, |\hat T - T| / (T - 273.15)
+
+    The zero of the Celsius scale is arbitrary, and so is this number; it is here to stand beside
+    the published ones (Narayanan et al. 2026, doi:10.48550/arXiv.2509.11334) and is labelled. Both
+    are temperatures [K] of the same coordinates.
+    """
+    result = 100.0 * abs(estimate - truth) / (truth - zero_Celsius)
+    label = "error relative to the true temperature in degrees Celsius"
+    bare: xr.DataArray = result.drop_attrs(deep=False).rename("relative_error")
+    return bare.assign_attrs(long_name=label, units="percent")
+
+
+def reflected_change(apparent: xr.DataArray, result: xr.Dataset) -> xr.DataArray:
+    r"""Change of the first band's apparent temperature that the reflection causes.
+
+    .. math:: (1 - e_1) (y - \bar y)
+
+    with the mean over time, in the linear response of small changes, (time, y, x) [K], float32; NaN
+    where the reflection is unknown. Of a constant object without a completed background it is the
+    change of the apparent temperature. That is of the inputs (band, time, y, x) [K], from
+    `response.apparent_temperature`; the result from `solve`, `separate` or `complete`, of the same
+    capture. ValueError if the first bands, sizes or coordinates differ.
+    """
+    if str(apparent["band"].values[0]) != str(result["band"].values[0]):
+        raise ValueError(
+            f"Invalid first band '{apparent['band'].values[0]}'. "
+            f"Must be '{result['band'].values[0]}', as in the result."
+        )
+    first = apparent.isel(band=0, drop=True)
+    first = laid_on(first, result, "the apparent temperature", "the result")
+    background = result["background_temperature"]
+    reflectivity = 1.0 - result["emissivity"].isel(band=0, drop=True)
+    change = (background - background.mean("time")) * reflectivity
+    constant = (result["status"] & int(schema.Status.CONSTANT_OBJECT)) != 0
+    without = constant & background.isnull().all("time")
+    change = change.where(~without, first - first.mean("time"))
+    attrs = {"units": "K", "long_name": "reflection, change of the apparent temperature"}
+    return change.astype("float32").rename("reflected_change").assign_attrs(attrs)

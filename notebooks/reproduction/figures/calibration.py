@@ -57,9 +57,8 @@ def response_fit(response: xr.Dataset, fine: xr.DataArray) -> Figure:
         top.set(title=band_label(band), ylabel="signal [count]")
         top.legend(["Sakuma-Hattori", "linear", "blackbody"], frameon=False, fontsize=8)
         kelvin = 1.0 / curve["linear_slope"]
-        middle.plot(
-            celsius, curve["linear_residual"] * kelvin, "s--", color=COLORS[2], markersize=3
-        )
+        residual = curve["linear_residual"] * kelvin
+        middle.plot(celsius, residual, "s--", color=COLORS[2], markersize=3)
         middle.set(ylabel="residual of the line\n[K]")
         millikelvin = 1e3 * curve["residual"] * kelvin
         bottom.plot(celsius, millikelvin, "o-", color=COLORS[0], markersize=3)
@@ -113,9 +112,8 @@ def emissivity_by_contact(measured: xr.Dataset, table: xr.DataArray | None = Non
     axis.set_xticks(place, [str(name).replace(" ", "\n") for name in measured["material"].values])
     axis.set(ylabel="emissivity [1]", ylim=(0, 1.05))
     figure.legend(frameon=False, loc="outside right center", fontsize=8)
-    axis.set_title(
-        "Emissivity by contact, one standard deviation" + drawing.provenance_note(measured)
-    )
+    note = drawing.provenance_note(measured)
+    axis.set_title(f"Emissivity by contact, one standard deviation{note}")
     return figure
 
 

@@ -81,10 +81,8 @@ def reductions(reduction: xr.DataArray, published: Sequence[float]) -> Figure:
     """Reduction of the error by each loss term (term) [%] beside the published ones, as bars."""
     figure, ((axis,),) = canvas(1, 1, (6.0, 3.4))
     place = np.arange(reduction.sizes["term"])
-    for shift, values, label, color in (
-        (-0.2, reduction.values, "here", COLORS[0]),
-        (0.2, np.asarray(published), "the paper", "0.6"),
-    ):
+    ours, theirs = (-0.2, reduction.values, "here", COLORS[0]), (0.2, published, "the paper", "0.6")
+    for shift, values, label, color in (ours, theirs):
         bars = axis.bar(place + shift, values, 0.38, label=label, color=color)
         axis.bar_label(bars, fmt="%.1f", fontsize=8, padding=2)
     axis.axhline(0.0, color="black", linewidth=0.6)
@@ -106,9 +104,8 @@ def sensitivity(errors: xr.DataArray, base: float) -> Figure:
     axis.invert_yaxis()
     axis.set_xlabel("median error of the object temperature [K]")
     axis.legend(frameon=False, fontsize=8)
-    axis.set_title(
-        "Settings of the optimiser, one changed at a time" + drawing.provenance_note(errors)
-    )
+    note = drawing.provenance_note(errors)
+    axis.set_title(f"Settings of the optimiser, one changed at a time{note}")
     return figure
 
 
@@ -119,11 +116,8 @@ def descents(courses: xr.Dataset) -> Figure:
     axes; an optimiser with one look, the others missing, is a mark.
     """
     figure, axes = canvas(1, 2, (9.0, 3.6))
-    for axis, (across, up) in zip(
-        axes[0],
-        (("iteration", "objective"), ("time", "object_temperature_rmse")),
-        strict=True,
-    ):
+    names = (("iteration", "objective"), ("time", "object_temperature_rmse"))
+    for axis, (across, up) in zip(axes[0], names, strict=True):
         for index, name in enumerate(courses["optimiser"].values):
             course = courses.sel(optimiser=name)
             axis.loglog(course[across], course[up], label=str(name), **drawing.marked_line(index))
@@ -151,21 +145,13 @@ def emissivity_procedures(
     marks = len(procedures) + len(published)
     shifts = iter(0.14 * (np.arange(marks) - (marks - 1) / 2))
     for index, name in enumerate(procedures):
-        by_procedure = in_band.sel(procedure=name)
-        axis.errorbar(
-            place + next(shifts),
-            by_procedure["mean"],
-            by_procedure["spread"],
-            fmt="o",
-            markersize=4,
-            color=COLORS[index],
-            label=str(name),
-        )
-    for index, (label, values) in enumerate(published.items()):
+        mean, spread = (in_band[it].sel(procedure=name) for it in ("mean", "spread"))
+        style = {"fmt": "o", "markersize": 4, "color": COLORS[index], "label": str(name)}
+        axis.errorbar(place + next(shifts), mean, spread, **style)
+    for marker, (label, values) in zip("sD", published.items(), strict=False):
         shown = [values[str(name)] for name in objects]
-        axis.plot(
-            place + next(shifts), shown, "sD"[index], color="0.3", label=label, fillstyle="none"
-        )
+        style = {"color": "0.3", "label": label, "fillstyle": "none"}
+        axis.plot(place + next(shifts), shown, marker, **style)
     axis.set_xticks(place, list(objects))
     axis.set(ylabel=f"emissivity, {band_label(band)} [1]", ylim=(0, 1.05))
     axis.legend(frameon=False, fontsize=8, loc="upper left", ncols=2)
@@ -183,10 +169,8 @@ def compared_reflections(ours: xr.DataArray, theirs: xr.DataArray, scores: xr.Da
     figure, axes = canvas(3, columns, (3.2 * columns, 8.0))
     for index in range(columns):
         moment = f"{float(ours['time'][index]):.1f} s"
-        for axis, movie, name in (
-            (axes[0, index], ours, "ours"),
-            (axes[1, index], theirs, "published"),
-        ):
+        rows = zip(axes[:2, index], (ours, theirs), ("ours", "published"), strict=True)
+        for axis, movie, name in rows:
             image, title = movie.isel(time=index), f"{name}, {moment}"
             scale = limits_of(image)
             draw_image(figure, axis, image, title, "own unit [1]", cmap="magma", limits=scale)
@@ -216,9 +200,8 @@ def error_over_bound(measured: xr.Dataset) -> Figure:
     """
     cases = measured if "case" in measured.dims else measured.expand_dims(case=[""])
     figure, axes = canvas(2, 2, (9.0, 6.2))
-    for (above, below), name, unit in zip(
-        axes.T, ("reflection_ratio", "object_temperature"), ("1", "K"), strict=True
-    ):
+    quantities = ("reflection_ratio", "object_temperature")
+    for (above, below), name, unit in zip(axes.T, quantities, ("1", "K"), strict=True):
         once = "case" not in cases[f"{name}_error"].dims
         for index, case in enumerate(cases["case"].values):
             of_case, mark = cases.sel(case=case), drawing.marked_line(index)
@@ -228,9 +211,8 @@ def error_over_bound(measured: xr.Dataset) -> Figure:
             above.plot(of_case["noise"], bound, **line)
             below.plot(of_case["noise"], error / bound, **mark)
             if not once:
-                above.plot(
-                    of_case["noise"], error, label=f"{label}measured", **mark | {"linewidth": 0}
-                )
+                mark |= {"linewidth": 0, "label": f"{label}measured"}
+                above.plot(of_case["noise"], error, **mark)
         if once:
             above.plot(cases["noise"], cases[f"{name}_error"], "ko", markersize=4, label="measured")
         label = f"error of the {name.replace('_', ' ')} [{unit}]"
@@ -254,9 +236,8 @@ def pooling(measured: xr.Dataset) -> Figure:
     """
     figure, ((first, second),) = canvas(1, 2, (9.0, 3.6))
     size = measured["size"]
-    first.plot(
-        size, measured["reflection_ratio_bound"], color="black", linewidth=0.8, label="bound"
-    )
+    bound = measured["reflection_ratio_bound"]
+    first.plot(size, bound, color="black", linewidth=0.8, label="bound")
     first.plot(size, measured["stated"], color=COLORS[3], linewidth=1.2, label="stated")
     first.plot(size, measured["reflection_ratio_error"], "o", color=COLORS[0], label="measured")
     second.plot(size, measured["object_temperature_error"], "o-", color=COLORS[1], linewidth=1)

@@ -8,16 +8,8 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from dbthermal.figures import REASONS, first_reason
-from dbthermal.figures.drawing import (
-    COLORS,
-    band_label,
-    canvas,
-    marked_line,
-    percent,
-    plain_decades,
-    provenance_note,
-)
+from dbthermal.figures import REASONS, drawing, first_reason
+from dbthermal.figures.drawing import COLORS, band_label, canvas, marked_line
 
 _RIGHT, _WRONG = "#a8d5b0", "#e3000f"
 # What a 95 % interval should hold, where the axis of the coverage begins, and its arrow lies [%].
@@ -46,7 +38,7 @@ def accuracy(sweep: xr.Dataset) -> Figure:
     first.set_xlabel("median RMSE of the object temperature [K]")
     second.set_xlabel("median error of the emissivity [1]")
     second.set_yticklabels([])
-    figure.suptitle("Accuracy of the separation" + provenance_note(sweep))
+    figure.suptitle("Accuracy of the separation" + drawing.provenance_note(sweep))
     return figure
 
 
@@ -65,7 +57,7 @@ def error_bar_calibration(scores: Mapping[str, xr.DataArray]) -> Figure:
         axis.set(title=name.replace("_", " "), xlabel="error / standard deviation [1]")
     axes[0, 0].set_ylabel("density [1]")
     data = next(iter(scores.values()))
-    figure.suptitle("Error bars against errors" + provenance_note(data))
+    figure.suptitle("Error bars against errors" + drawing.provenance_note(data))
     return figure
 
 
@@ -100,30 +92,25 @@ def validity(stress: xr.Dataset) -> Figure:
     rows = max(-(-len(words[1]) // 2), len(dots[1]))
     figure.set_figheight(0.29 * place.size + 0.18 * rows + 1.7)
     figure.legend(*dots, loc="outside lower right", **style)
-    figure.suptitle("Which pixels can be trusted, and why not" + provenance_note(stress))
+    figure.suptitle("Which pixels can be trusted, and why not" + drawing.provenance_note(stress))
     return figure
 
 
 def _bars(axis: Axes, flags: xr.DataArray, bad: xr.DataArray) -> None:
     """Stacked bars (case): right, wrong, and each flag; the wrong ones as a number, too."""
     first, wrong = first_reason(flags.transpose("case", "pixel")), bad.transpose("case", "pixel")
-    colors = {
-        "no flag and right": (_RIGHT, (first == "") & ~wrong.values),
-        "no flag and wrong (error above 4 standard deviations)": (
-            _WRONG,
-            (first == "") & wrong.values,
-        ),
-    }
+    colors = {"no flag and right": (_RIGHT, (first == "") & ~wrong.values)}
+    unseen = (_WRONG, (first == "") & wrong.values)
+    colors["no flag and wrong (error above 4 standard deviations)"] = unseen
     colors |= {words: (color, first == name) for name, (words, color) in REASONS.items()}
     place, reached = np.arange(flags.sizes["case"]), np.zeros(flags.sizes["case"])
     for label, (color, mask) in colors.items():
         share = 100 * mask.mean(axis=1)
         if share.any() or color in {_RIGHT, _WRONG}:
             axis.barh(place, share, 0.8, left=reached, color=color, label=label)
-        for row in (
-            np.flatnonzero(share).tolist() if color == _WRONG else ()
-        ):  # some are too small to see
-            text = f"{percent(share[row] / 100)} wrong"
+        # Some of the wrong ones are too small to see.
+        for row in np.flatnonzero(share).tolist() if color == _WRONG else ():
+            text = f"{drawing.percent(share[row] / 100)} wrong"
             axis.text(101, row, text, color=_WRONG, fontsize=8, fontweight="bold", va="center")
         reached += share
     axis.set(xlim=(0, 100), xlabel="share of the pixels [%]")
@@ -141,9 +128,8 @@ def _dots(axis: Axes, coverage: dict[str, xr.DataArray]) -> None:
         axis.plot(np.full(low.size, _ARROW), low, "<", color=color, markersize=5)
     empty = np.all([share.isnull() for share in coverage.values()], axis=0)
     for row in np.flatnonzero(empty).tolist():
-        axis.text(
-            _SPAN[0] - 2, row, "none to judge", color="0.5", fontsize=8, va="center", ha="right"
-        )
+        text, end = "none to judge", _SPAN[0] - 2
+        axis.text(end, row, text, color="0.5", fontsize=8, va="center", ha="right")
     axis.set(xlim=(_LOWEST - 3, 100.5), xlabel="95 % intervals that hold the truth [%]")
     axis.set_title(f"arrow: below {_LOWEST:.0f} %", loc="left", fontsize=8, color="0.4")
     axis.grid(visible=True, axis="y", color="0.93")
@@ -170,7 +156,7 @@ def offsets(measured: xr.Dataset) -> Figure:
     third.set(ylabel="flagged [%]", ylim=(-3, 103))
     _over((first, second, third), "offset of the second band [frame]")
     second.legend(frameon=False, fontsize=8)
-    figure.suptitle("Bands exposed apart" + provenance_note(measured))
+    figure.suptitle("Bands exposed apart" + drawing.provenance_note(measured))
     return figure
 
 
@@ -193,7 +179,7 @@ def disturbances(measured: xr.Dataset) -> Figure:
     _kelvin(axis)
     axis.margins(y=0.2)
     axis.legend(frameon=False, fontsize=8)
-    axis.set_title("Lost frames and a closed shutter" + provenance_note(measured))
+    axis.set_title("Lost frames and a closed shutter" + drawing.provenance_note(measured))
     return figure
 
 
@@ -213,7 +199,7 @@ def parallax(measured: xr.Dataset) -> Figure:
     third.set(ylabel="95 % intervals that hold, no flag [%]", ylim=(-3, 103))
     _over((first, second, third), "parallax of the reflection [pixel]")
     first.legend(frameon=False, fontsize=8)
-    figure.suptitle("Two cameras side by side" + provenance_note(measured))
+    figure.suptitle("Two cameras side by side" + drawing.provenance_note(measured))
     return figure
 
 
@@ -235,4 +221,4 @@ def _over(axes: Iterable[Axes], label: str) -> None:
 def _kelvin(axis: Axes) -> None:
     """A logarithmic axis of errors, with plain numbers."""
     axis.set(yscale="log", ylabel=_RMSE_LABEL)
-    plain_decades(axis)
+    drawing.plain_decades(axis)

@@ -13,14 +13,7 @@ from scipy.constants import zero_Celsius
 from dbthermal import schema
 from dbthermal._coordinates import laid_on
 from dbthermal.figures import FilmPanel, drawing, film
-from dbthermal.figures.drawing import (
-    COLORS,
-    band_label,
-    canvas,
-    draw_image,
-    limits_of,
-    provenance_note,
-)
+from dbthermal.figures.drawing import COLORS, band_label, canvas, draw_image, limits_of
 
 _CELSIUS: Final = "[\N{DEGREE SIGN}C]"
 
@@ -129,10 +122,8 @@ def separated_film(
     emission = laid_on(emission, apparent, "the emission", "the inputs")
     change = laid_on(change, apparent, "the reflection", "the inputs")
     names = apparent["band"].values
-    panels = [
-        FilmPanel(apparent.sel(band=band) - zero_Celsius, f"input {band_label(band)}")
-        for band in names
-    ]
+    inputs = {name: apparent.sel(band=name) - zero_Celsius for name in names}
+    panels = [FilmPanel(image, f"input {band_label(name)}") for name, image in inputs.items()]
     panels.append(FilmPanel(emission - zero_Celsius, "emission"))
     panels.append(FilmPanel(change, "reflection less its mean", "[K]", symmetric=True))
     yield from film(panels, title=title + drawing.provenance_note(apparent))
@@ -151,21 +142,16 @@ def thermocouples(scores: xr.Dataset) -> Figure:
         for index, variant in enumerate(of_scene["variant"].values):
             of_variant = of_scene.sel(variant=variant)
             error = float(of_variant["relative_error"])
-            read = of_variant["temperature"].dropna("time")
-            axis.plot(
-                read["time"],
-                read - zero_Celsius,
-                color=COLORS[index % len(COLORS)],
-                linewidth=1,
-                linestyle="-" if index < len(COLORS) else "--",
-                label=f"{variant}, {error:.2g} %" if isfinite(error) else f"{variant}, no value",
-            )
+            read = of_variant["temperature"].dropna("time") - zero_Celsius
+            label = f"{variant}, {error:.2g} %" if isfinite(error) else f"{variant}, no value"
+            line = {"color": COLORS[index % len(COLORS)], "linewidth": 1, "label": label}
+            axis.plot(read["time"], read, "-" if index < len(COLORS) else "--", **line)
         reading = of_scene["reading"] - zero_Celsius
         axis.plot(reading["time"], reading, color="black", linewidth=1.5, label="thermocouple")
         axis.set(xlabel="time [s]", title=str(name).replace("_", " "))
         axis.legend(frameon=False, fontsize=8)
     axes[0, 0].set_ylabel("object temperature [\N{DEGREE SIGN}C]")
-    figure.suptitle("At the thermocouple" + provenance_note(scores))
+    figure.suptitle("At the thermocouple" + drawing.provenance_note(scores))
     return figure
 
 
@@ -183,8 +169,8 @@ def error_maps(picture: xr.DataArray, errors: Mapping[str, xr.DataArray]) -> Fig
     for axis, (name, error) in zip(axes[0, 1:], errors.items(), strict=True):
         scale = (0.0, limits_of(error)[1])
         draw_image(figure, axis, error, name, "mean error [K]", cmap="magma_r", limits=scale)
-    data = next(iter(errors.values()))
-    figure.suptitle("Error of the object temperature, mean over frames" + provenance_note(data))
+    note = drawing.provenance_note(next(iter(errors.values())))
+    figure.suptitle(f"Error of the object temperature, mean over frames{note}")
     return figure
 
 
@@ -200,10 +186,8 @@ def hours(readings: xr.DataArray, middles: Sequence[float], flags: Sequence[str]
         axis.plot(time, celsius.sel(band=name), lw=0.7, label=str(name))
     low, high = float(celsius.min()), float(celsius.max())
     for hour, words in zip(middles, flags, strict=True):
-        text = words.replace(", ", "\n") or "no flag"
-        axis.text(
-            hour, high + 0.1 * (high - low), text, ha="center", va="bottom", rotation=90, fontsize=6
-        )
+        text, place = words.replace(", ", "\n") or "no flag", high + 0.1 * (high - low)
+        axis.text(hour, place, text, ha="center", va="bottom", rotation=90, fontsize=6)
     axis.set(ylim=(low - 1.0, high + 0.9 * (high - low)), xlim=(0.0, 24.0))
     axis.set_xlabel("universal time [h]")
     axis.set_ylabel("reading [°C]")

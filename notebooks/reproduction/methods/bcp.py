@@ -84,9 +84,8 @@ def _remove(tile: Tile, settings: BcpSettings, band: int) -> tuple[Array, Array,
         curve = tile.curves[band]
         value = require_range(settings.reflected_temperature, curve, "reflected_temperature")
         fixed = float(tile.blackbody(band, value))
-    for frame, (signal, usable) in enumerate(
-        zip(tile.signals[band], _usable(tile, band), strict=True)
-    ):
+    frames = zip(tile.signals[band], _usable(tile, band), strict=True)
+    for frame, (signal, usable) in enumerate(frames):
         mixed = usable.any() and not usable.all()
         filled = np.where(usable, signal, np.median(signal[usable])) if mixed else signal
         image = filled.reshape(tile.shape)

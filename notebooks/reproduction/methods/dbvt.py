@@ -31,10 +31,7 @@ from reproduction.methods.naive import require
 
 # Largest departure of an interval from the median one, relative to it.
 _UNEVEN: Final = 0.5
-_CHOICES: Final = {
-    "start": ("random", "subspace"),
-    "temperatures_from": ("corrected", "measured"),
-}
+_CHOICES: Final = {"start": ("random", "subspace"), "temperatures_from": ("corrected", "measured")}
 
 
 @dataclass(frozen=True)
@@ -208,11 +205,9 @@ class Search:
         # u_1(x) = (z_2 - k_2 z_1) / (1 - k_2), u_1(y) = (z_2 - k_1 z_1) / (1 - k_1)
         for ratio in ((1 - e2) / (1 - e1), e2 / e1):
             signal = (second - ratio * first) / (1 - ratio)
-            temperature = tile.temperature(0, signal)
-            curve = tile.curves[0]
-            in_range &= np.all(
-                (temperature >= curve.lowest) & (temperature <= curve.highest), axis=1
-            )
+            temperature, curve = tile.temperature(0, signal), tile.curves[0]
+            within = (temperature >= curve.lowest) & (temperature <= curve.highest)
+            in_range &= np.all(within, axis=1)
             departures.append(tile.blackbody(1, temperature) - signal)
         return np.where(in_range[:, np.newaxis], mixing.mixed(e2, *departures), 0.0)
 
@@ -228,24 +223,17 @@ def _report(
         replace(tile, signals=signals, emissivity=emissivity, emissivity_covariance=None),
         calibrated.CalibratedSettings(smooth=False),
     )
-    measured = "object_temperature", "background_temperature", "emissivity"
+    # NaN where the pixel is lost, and everywhere in what this method does not estimate.
+    missing = dict.fromkeys(("object_temperature", "background_temperature", "emissivity"), lost)
+    missing |= dict.fromkeys(METHOD.not_estimated, np.ones_like(lost))
     arrays: dict[str, Any] = {
-        name: np.where(lost, np.nan, getattr(solution, name)) for name in measured
+        name: np.where(pixels, np.nan, getattr(solution, name)) for name, pixels in missing.items()
     }
-    return replace(
-        solution,
-        **arrays,
-        **{name: np.full_like(getattr(solution, name), np.nan) for name in METHOD.not_estimated},
-        status=solution.status | status_bits({Status.NOT_CONVERGED: unfinished}),
-    )
+    status = solution.status | status_bits({Status.NOT_CONVERGED: unfinished})
+    return replace(solution, **arrays, status=status)
 
 
 METHOD: Final = Method(
-    separate,
-    DbvtSettings,
-    "dbvt",
-    minimum_frames=8,
-    every_frame=True,
-    not_estimated=WITHOUT_STD,
+    separate, DbvtSettings, "dbvt", minimum_frames=8, every_frame=True, not_estimated=WITHOUT_STD
 )
 """The paper's optimiser, for `solve`."""

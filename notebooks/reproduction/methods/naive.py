@@ -90,10 +90,8 @@ def separate(tile: Tile, settings: NaiveSettings) -> Estimate:
         (temperature, background), emissivity = np.exp(kept.logarithms), expit(kept.logits)
     lost = ~np.isfinite(kept.objective)
     status = status_bits({Status.NOT_CONVERGED: kept.active | lost})
-    temperature, background, emissivity = (
-        np.where(lost, np.nan, array) for array in (temperature, background, emissivity)
-    )
-    estimate = Estimate.without_std(tile, temperature, status, emissivity, background)
+    arrays = [np.where(lost, np.nan, array) for array in (temperature, emissivity, background)]
+    estimate = Estimate.without_std(tile, arrays[0], status, *arrays[1:])
     return estimate.check_range(tile.curves[0], not_estimated=WITHOUT_STD)
 
 
@@ -190,9 +188,8 @@ def _jacobian(tile: Tile, state: _State) -> tuple[Array, Array]:
 def _symmetric(matrix: tuple[Array, Array, Array], right: Array) -> Array:
     """Solve ((a, b), (b, c)) x = right, the two rows along the first axis."""
     a, b, c = matrix
-    return np.asarray(
-        np.stack([c * right[0] - b * right[1], a * right[1] - b * right[0]]) / (a * c - b * b)
-    )
+    rows = np.stack([c * right[0] - b * right[1], a * right[1] - b * right[0]])
+    return np.asarray(rows / (a * c - b * b))
 
 
 METHOD: Final = Method(separate, NaiveSettings, "naive", not_estimated=WITHOUT_STD)

@@ -83,10 +83,9 @@ def separate(tile: Tile, settings: RatioSettings) -> Estimate:
     np.divide(emissivity.sum(axis=0), frames, out=mean, where=frames > 0)
     odd = (mean <= 0) | (mean >= 1)
     bits = {Status.OUTSIDE_RESPONSE: frames < len(valid), Status.NONPHYSICAL_EMISSIVITY: odd}
-    status = status_bits(bits)
-    return Estimate.without_std(tile, temperature, status, np.stack([mean, mean])).check_range(
-        first, not_estimated=WITHOUT_BACKGROUND
-    )
+    both = np.stack([mean, mean])
+    estimate = Estimate.without_std(tile, temperature, status_bits(bits), both)
+    return estimate.check_range(first, not_estimated=WITHOUT_BACKGROUND)
 
 
 def _radiance(curve: Curve, kind: str, temperature: Array) -> Array:

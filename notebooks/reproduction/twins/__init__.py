@@ -7,53 +7,32 @@ project's own; known of the originals are their names and two thermocouple readi
 
 from collections.abc import Callable
 from functools import partial
-from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
 import xarray as xr
 
+from dbthermal import _text as texts
 from reproduction.twins.bodies import COFFEE_POT, WINEGLASS, bunny, filled
 from reproduction.twins.panes import fingerprint, fingers, glass_plate
-from reproduction.twins.stage import (
-    Capture,
-    Stage,
-    observe,
-    registered,
-    take,
-    thermocouple_readings,
-)
+from reproduction.twins.stage import Capture, Stage, take
 
-__all__ = [
-    "TWINS",
-    "Capture",
-    "Stage",
-    "observe",
-    "registered",
-    "take",
-    "thermocouple_readings",
-    "twin",
-]
-
-TWINS: Final[MappingProxyType[str, Callable[..., Stage]]] = MappingProxyType(
-    {
-        "wineglass": partial(filled, vessel=WINEGLASS),
-        "coffee_pot": partial(filled, vessel=COFFEE_POT),
-        "glass_plate": glass_plate,
-        "fingers": fingers,
-        "fingerprint": fingerprint,
-        "bunny": bunny,
-    }
-)
+TWINS: Final[dict[str, Callable[..., Stage]]] = {
+    "wineglass": partial(filled, vessel=WINEGLASS),
+    "coffee_pot": partial(filled, vessel=COFFEE_POT),
+    "glass_plate": glass_plate,
+    "fingers": fingers,
+    "fingerprint": fingerprint,
+    "bunny": bunny,
+}
 """Name -> function that sets the stage."""
 
 
 def twin(name: str, capture: Capture, rng: np.random.Generator, **options: Any) -> xr.Dataset:
-    """Scene (see `take`) of a twin of `TWINS`, with attribute `twin`.
+    """Scene (see `stage.take`) of a twin of `TWINS`, with attribute `twin`.
 
     The rng is the source of all motion; options are `visitor` of "fingerprint" and `scan` of
     "bunny".
     """
-    if name not in TWINS:
-        raise ValueError(f"Unknown twin '{name}'. Must be one of {[*TWINS]}.")
+    texts.check_listed("Unknown twin", name, TWINS)
     return take(TWINS[name](capture, rng, **options), capture)

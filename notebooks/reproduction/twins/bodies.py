@@ -120,15 +120,10 @@ COFFEE_POT: Final = Vessel(
 def filled(capture: Capture, rng: np.random.Generator, vessel: Vessel) -> Stage:
     """Vessel on a table that is being filled, with two people walking near."""
     mesh = surfaces.vessel(vessel.profile, vessel.spacing)
-    wall = (vessel.thickness, vessel.solid)
-    return Stage(
-        vessel.name,
-        mesh,
-        since(vessel.start, mesh, wall, capture.time, vessel.exchanges(mesh)),
-        Camera(*vessel.view, capture.shape),
-        [table(), *passers_by(capture.time, rng)],
-        [surfaces.on_wall(mesh, *vessel.probe)],
-    )
+    wall, camera = (vessel.thickness, vessel.solid), Camera(*vessel.view, capture.shape)
+    warm = since(vessel.start, mesh, wall, capture.time, vessel.exchanges(mesh))
+    actors, probe = [table(), *passers_by(capture.time, rng)], surfaces.on_wall(mesh, *vessel.probe)
+    return Stage(vessel.name, mesh, warm, camera, actors, [probe])
 
 
 EMISSIVITY: Final = 0.9  # total hemispherical emissivity of the bunny [1], for its radiation alone
@@ -161,18 +156,11 @@ def bunny(
         on = -np.expm1(-max(time - LAMP_START, 0.0) / LAMP_RISE)
         return np.asarray(LAMP_FLUX * on * facing)
 
-    exchanges: list[heat.Exchange] = [
-        heat.Heating(flux),
-        heat.Convection(AIR, AMBIENT),
-        heat.Radiation(EMISSIVITY, AMBIENT),
-    ]
-    return Stage(
-        "bunny",
-        mesh,
-        since(LAMP_START, mesh, BUNNY_WALL, capture.time, exchanges),
-        Camera((0.0, -0.54, 0.36), (0.0, 0.0, 0.07), capture.shape),
-        [table(), *_toys(capture.time, rng), *passers_by(capture.time, rng)],
-    )
+    room = (heat.Convection(AIR, AMBIENT), heat.Radiation(EMISSIVITY, AMBIENT))
+    warm = since(LAMP_START, mesh, BUNNY_WALL, capture.time, [heat.Heating(flux), *room])
+    camera = Camera((0.0, -0.54, 0.36), (0.0, 0.0, 0.07), capture.shape)
+    actors = [table(), *_toys(capture.time, rng), *passers_by(capture.time, rng)]
+    return Stage("bunny", mesh, warm, camera, actors)
 
 
 def _stood(scan: trimesh.Trimesh) -> trimesh.Trimesh:

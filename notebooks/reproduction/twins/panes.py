@@ -84,26 +84,17 @@ AWAY: Final = (0.0, -0.5)
 WITHDRAWAL: Final = 1.0  # time in which it comes, and goes [s]
 
 
-def glass_plate(
-    capture: Capture, rng: np.random.Generator, *, writing: Writing | None = None
-) -> Stage:
+def glass_plate(capture: Capture, rng: np.random.Generator) -> Stage:
     """Plate heated by a hot-air gun, in which a board is reflected while somebody writes on it.
 
-    By default the letters CV with a cold, wet finger, begun at a random moment within 2 s.
+    The letters CV with a cold, wet finger, begun at a random moment within 2 s.
     """
-    pane, gun = Pane(), Gun()
-    writing = writing or Writing(start=float(rng.uniform(2.0, 4.0)))
+    pane, gun, writing = Pane(), Gun(), Writing(start=float(rng.uniform(2.0, 4.0)))
     mesh, start = pane.mesh(), gun.start - _BEFORE * gun.rise
     camera = Camera((0.24, -0.62, 0.0), (0.0, 0.0, 0.0), capture.shape)
-    return Stage(
-        "glass_plate",
-        mesh,
-        pane.temperature(start, mesh, capture.time, gun.blast(mesh)),
-        camera,
-        _written(writing, camera),
-        [(0.02, 0.0, 0.01)],
-        BOARD_DISTANCE,
-    )
+    warm = pane.temperature(start, mesh, capture.time, gun.blast(mesh))
+    actors, probe = _written(writing, camera), (0.02, 0.0, 0.01)
+    return Stage("glass_plate", mesh, warm, camera, actors, [probe], BOARD_DISTANCE)
 
 
 def _written(writing: Writing, camera: Camera) -> list[Actor]:
@@ -147,14 +138,9 @@ def fingers(capture: Capture, rng: np.random.Generator) -> Stage:
     """
     mesh = Pane().mesh()
     camera = Camera((0.33, -0.39, 0.0), (0.0, 0.0, 0.0), capture.shape)
-    return Stage(
-        "fingers",
-        mesh,
-        np.full((capture.time.size, len(mesh.vertices)), AMBIENT),
-        camera,
-        hand(_waving(capture.time, rng), flex=0.5),
-        [(0.0, 0.0, 0.03)],
-    )
+    level = np.full((capture.time.size, len(mesh.vertices)), AMBIENT)
+    actors = hand(_waving(capture.time, rng), flex=0.5)
+    return Stage("fingers", mesh, level, camera, actors, [(0.0, 0.0, 0.03)])
 
 
 def _waving(time: Array, rng: np.random.Generator) -> Motion:
@@ -206,12 +192,8 @@ def fingerprint(
     pane, touch = Pane(spacing=spacing), Touch()
     mesh = pane.mesh()
     share = imprint(np.asarray(mesh.vertices)[:, [0, 2]] + (0.0, 0.03))
+    warm = pane.temperature(touch.start, mesh, capture.time, touch.press(share))
+    camera = Camera((0.12, -0.50, 0.02), (0.0, 0.0, 0.0), capture.shape)
     floor = -TABLE - pane.height / 2
-    return Stage(
-        "fingerprint",
-        mesh,
-        pane.temperature(touch.start, mesh, capture.time, touch.press(share)),
-        Camera((0.12, -0.50, 0.02), (0.0, 0.0, 0.0), capture.shape),
-        person(pacing(VISIT, capture.time, rng), height=floor) if visitor else [],
-        [(0.0, 0.0, -0.03)],
-    )
+    actors = person(pacing(VISIT, capture.time, rng), height=floor) if visitor else []
+    return Stage("fingerprint", mesh, warm, camera, actors, [(0.0, 0.0, -0.03)])

@@ -51,26 +51,21 @@ class Route:
         return float(np.arctan2(legs[last, 1], legs[last, 0]))
 
 
-def pacing(
-    corners: npt.ArrayLike,
-    time: Array,
-    rng: np.random.Generator,
-    *,
-    pace: tuple[float, float] = (0.5, 1.0),
-    pause: tuple[float, float] = (0.3, 2.0),
-) -> Route:
+_PACE, _PAUSE = (0.5, 1.0), (0.3, 2.0)  # least and largest: pace of a leg [m/s], pause [s]
+
+
+def pacing(corners: npt.ArrayLike, time: Array, rng: np.random.Generator) -> Route:
     """Route back and forth along corners (stop, 2) [m] that covers the times [s].
 
-    The first end, the pace of each leg, within its least and largest [m/s], and the pauses [s] are
-    random.
+    The first end, the pace of each leg and the pauses are random.
     """
     points = np.asarray(corners, dtype=np.float64)[:: int(rng.choice([-1, 1]))]
     endless = itertools.cycle([*points, *points[-2:0:-1]])
     times, places = [float(time[0])], [next(endless)]
     while times[-1] < time[-1]:
-        stop, start = next(endless), times[-1] + rng.uniform(*pause)
+        stop, start = next(endless), times[-1] + rng.uniform(*_PAUSE)
         length = float(np.linalg.norm(stop - places[-1]))
-        times += [start, start + length / rng.uniform(*pace)]
+        times += [start, start + length / rng.uniform(*_PACE)]
         places += [places[-1], stop]
     return Route(np.array(times), np.array(places))
 
@@ -133,43 +128,43 @@ FINGERS: Final = (
     Finger((0.028, 0.030), (0.041, 0.085), 0.008),
 )
 """Thumb to little finger of a right hand, seen from its back; fingers point up."""
+_WARMTH, _RATE = 306.15, 0.8  # temperature of a hand [K], bends of its first finger [1/s]
+_SOFTNESS: Final = 0.002  # width of the edge of a print [m]
 
 
-def hand(
-    motion: Motion, skin: float = 306.15, *, flex: float = 0.0, rate: float = 0.8
-) -> list[Actor]:
+def hand(motion: Motion, *, flex: float = 0.0) -> list[Actor]:
     """Hand on its forearm, flat in the plane y = 0: palm with forearm, and five fingers.
 
-    The motion is that of the palm, the skin's temperature in [K]. Each finger bends at its root by
-    up to `flex` [rad]: the first at `rate` [1/s], each of the others a little more often.
+    The motion is that of the palm. Each finger bends at its root by up to `flex` [rad]: the first
+    at `_RATE`, each of the others a little more often.
     """
     bones = (ellipsoid(PALM, (0.0, 0.0, 0.0), _FINE), capsule(*FOREARM, _SPACING))
-    palm = painted([(bone, skin) for bone in bones], motion)
-    return [palm, *(_finger(n, motion, skin, flex, rate) for n in range(len(FINGERS)))]
+    palm = painted([(bone, _WARMTH) for bone in bones], motion)
+    return [palm, *(_finger(n, motion, flex) for n in range(len(FINGERS)))]
 
 
-def _finger(number: int, motion: Motion, skin: float, flex: float, rate: float) -> Actor:
+def _finger(number: int, motion: Motion, flex: float) -> Actor:
     finger = FINGERS[number]
     root, tip = ((x, 0.0, z) for x, z in (finger.root, finger.tip))
 
     @cache
     def bent(time: float) -> Pose:
-        phase = 2.0 * np.pi * rate * (1.0 + 0.13 * number) * time + number
+        phase = 2.0 * np.pi * _RATE * (1.0 + 0.13 * number) * time + number
         return motion(time) @ hinged(root, Rotation.from_euler("x", flex * np.sin(phase)))
 
-    return painted([(capsule(root, tip, finger.radius, _FINE), skin)], bent)
+    return painted([(capsule(root, tip, finger.radius, _FINE), _WARMTH)], bent)
 
 
-def imprint(places: npt.ArrayLike, softness: float = 0.002) -> Array:
+def imprint(places: npt.ArrayLike) -> Array:
     """Contact of a flat hand with a surface: 1 under the hand, 0 beyond it, smooth between.
 
-    Of places (place, 2), x and z in the plane of the hand [m]; the edge is `softness` wide [m].
+    Of places (place, 2), x and z in the plane of the hand [m].
     """
     places = np.asarray(places, dtype=np.float64)
     scale = np.linalg.norm(places / (PALM[0], PALM[2]), axis=1)
     palm = (1.0 - scale) * min(PALM[0], PALM[2])
     fingers = [finger.radius - _to_segment(places, finger.root, finger.tip) for finger in FINGERS]
-    return np.asarray(0.5 * (1.0 + np.tanh(np.max([palm, *fingers], axis=0) / softness)))
+    return np.asarray(0.5 * (1.0 + np.tanh(np.max([palm, *fingers], axis=0) / _SOFTNESS)))
 
 
 def _to_segment(places: Array, *ends: tuple[float, float]) -> Array:
@@ -180,15 +175,15 @@ def _to_segment(places: Array, *ends: tuple[float, float]) -> Array:
     return np.asarray(np.linalg.norm(places - start - share[:, np.newaxis] * along, axis=1))
 
 
-_TOY: Final = 0.006  # distance of the vertices of a toy [m]
+_TOY, _MOTOR = 0.006, 315.15  # distance of the vertices [m], and temperature of the bonnet [K]
 
 
-def toy(motion: Motion, *, body: float = 303.15, motor: float = 315.15) -> Actor:
-    """Toy car, 0.16 m long, that runs along x on z = 0, body and bonnet at temperatures [K]."""
+def toy(motion: Motion, *, body: float = 303.15) -> Actor:
+    """Toy car, 0.16 m long, that runs along x on z = 0: body at a temperature [K], warm bonnet."""
     frame = trimesh.creation.box((0.16, 0.07, 0.04)).apply_translation((0, 0, 0.035))
     cabin = trimesh.creation.box((0.08, 0.06, 0.04)).apply_translation((-0.02, 0, 0.07))
     bonnet = ellipsoid((0.03, 0.03, 0.012), (0.05, 0, 0.055), _TOY)
-    return painted([(frame, body), (cabin, body), (bonnet, motor)], motion)
+    return painted([(frame, body), (cabin, body), (bonnet, _MOTOR)], motion)
 
 
 LETTERS: Final = {

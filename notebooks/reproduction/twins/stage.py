@@ -99,9 +99,8 @@ def take(stage: Stage, capture: Capture) -> xr.Dataset:
         warm, cold, _ = _rendered(stage, capture, caster, second)
         for name, film in (("object", warm), ("background", cold)):
             scene[f"second_{name}_temperature"] = (dims, film.astype(np.float32), {"units": "K"})
-        for name, film in zip(
-            ("place_in_second", "shift"), _seen_by_both(stage, caster, second), strict=True
-        ):
+        maps = _seen_by_both(stage, caster, second)
+        for name, film in zip(("place_in_second", "shift"), maps, strict=True):
             scene[name] = (("axis", "y", "x"), film, {"units": "pixel"})
         scene = scene.assign_coords(axis=["y", "x"])
     # Pixels of the thermocouples.
@@ -130,12 +129,9 @@ def _rendered(
     shear = (np.arange(rays) - (rays - 1) / 2.0) / rays**2
     down = _optics(rows, capture)
     right = [_optics(columns, capture, offset) for offset in shear]
-    row, column = _places(rows, rays), _places(columns, rays)
     places = np.empty((rows * rays, columns * rays, 2))
-    places[..., 0], places[..., 1] = (
-        row[:, np.newaxis],
-        column + np.tile(shear, rows)[:, np.newaxis],
-    )
+    places[..., 0] = _places(rows, rays)[:, np.newaxis]
+    places[..., 1] = _places(columns, rays) + np.tile(shear, rows)[:, np.newaxis]
     directions = camera.directions(places.reshape(-1, 2))
     origins = np.array(np.broadcast_to(np.asarray(camera.position), directions.shape))
     hits = caster.cast(origins, directions)
@@ -236,12 +232,10 @@ def thermocouple_readings(
     if bead < 1 or bead % 2 == 0:
         raise ValueError(f"Invalid bead {bead} pixels. Must be odd and positive.")
     readings, reach = [], bead // 2
-    for row, column in zip(
-        scene["thermocouple_y"].values, scene["thermocouple_x"].values, strict=True
-    ):
-        square = scene.isel(
-            y=slice(row - reach, row + reach + 1), x=slice(column - reach, column + reach + 1)
-        )
+    centres = (scene[f"thermocouple_{axis}"].values for axis in ("y", "x"))
+    for row, column in zip(*centres, strict=True):
+        rows, columns = (slice(it - reach, it + reach + 1) for it in (row, column))
+        square = scene.isel(y=rows, x=columns)
         on = square["on_object"]
         if min(row, column) < reach or on.size < (2 * reach + 1) ** 2 or not on.all():
             label = f"Invalid thermocouple at row {row}, column {column}"
