@@ -297,6 +297,12 @@ def test_cameras_of_two_rates_and_a_part_of_them(results: Path) -> None:
     whole = store.open_dataset(results / "scene.zarr")["counts"][:, 20:120:3, 4:10]
     for name in ("part", "part2"):
         np.testing.assert_array_equal(store.open_dataset(results / f"{name}.zarr")["counts"], whole)
+    # Rows of rows take the gain and offset of these rows of the detector.
+    done(results, "import", "scene.zarr", "--rows", "2", "12", "-o", "rows.zarr")
+    done(results, "import", "rows.zarr", "--rows", "2", "8", "-o", "rows2.zarr")
+    done(results, "correct", "rows2.zarr", "nuc.zarr", "-o", "rows3.zarr")
+    corrected, rows = (store.open_dataset(results / f"{it}.zarr") for it in ("corrected", "rows3"))
+    np.testing.assert_array_equal(rows["counts"], corrected["counts"][:, :, 4:10])
 
 
 @pytest.mark.slow
@@ -612,6 +618,9 @@ separate scene.zarr response.zarr --correction nuc.zarr --corrected-by-camera -o
  -> Invalid correction of gain and offset: both
 {EXCHANGED} -> Warning: Counts of bands .* are files of the bands exchanged
 calibrate --at 5C --clock 10 -o x.zarr -> Invalid 0 files
+calibrate --blackbody response.zarr -o x.zarr --correction-output y.zarr
+ -> Unused option --correction-output. Must be left out: 'response.zarr' has no pixels
+info a*.tif --clock 10 -> Warning: 'a.tif to a70.tif' have .200, 16, 16, 16, 16. frames. Must be
 calibrate -o x.zarr -> Missing source. Must be one of --at, --blackbody
 calibrate --at 5C a5.tif + b5.tif --bands a b --clock 9 -o x.zarr -> Invalid blackbody frames of 1
 demo x --side -> unrecognized arguments: --side Did you mean '--side-by-side'

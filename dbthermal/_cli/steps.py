@@ -66,8 +66,7 @@ def demo(options: argparse.Namespace) -> dict[str, Any]:
     """Command `demo`."""
     tifffile = optional("tifffile", "recordings")
     folder: Path = options.folder
-    rig, rng = simulation.Rig(), np.random.default_rng(1)
-    stacks = _demo_stacks(rig, rng, apart=options.side_by_side)
+    stacks = _demo_stacks(simulation.Rig(), np.random.default_rng(1), apart=options.side_by_side)
     # All or nothing: a folder that has one of the files is left as it is.
     paths = {folder / f"{name}.tif": stack for name, stack in stacks.items()}
     for path in (path for path in paths if path.exists()):
@@ -127,6 +126,9 @@ def calibrate(options: argparse.Namespace) -> dict[str, Any]:
     if "frame" in blackbody.dims:
         blackbody = correction.blackbody_statistics(blackbody)
     fitted = correction.fit_correction(blackbody) if "y" in blackbody.dims else None
+    if fitted is None and options.correction_output:
+        rule = f"Must be left out: '{options.blackbody}' has no pixels"
+        raise ValueError(f"Unused option --correction-output. {rule}.")
     counts = blackbody["counts"] if fitted is None else fitted["level"]
     accuracies |= accepted(calibration.fit_response, options)
     response = calibration.fit_response(counts, blackbody.get("noise"), **accuracies)
@@ -156,9 +158,8 @@ def _blackbody(options: argparse.Namespace) -> xr.Dataset:
             raise ValueError(f"Invalid --at {temperature}. Must begin with a temperature: 20C.")
         offset = [0.0] * (len(options.bands or "ab") - 1)  # nothing moves: any will do
         still = files.capture(paths, options, offset)
-        good = np.arange(still.sizes["time"])
-        if "exposure_time" in still:  # padded and damaged frames have none
-            good = np.flatnonzero(still["exposure_time"].notnull().all("band"))
+        stamps = still.get("exposure_time", still["time"].expand_dims("band"))
+        good = np.flatnonzero(stamps.notnull().all("band"))  # padded and damaged frames have none
         files.check_all(good[frames].size, options, "frames", f"the blackbody at {temperature:g} K")
         movie = still[["counts"]].isel(time=good[frames]).load().drop_vars("time")
         movies.append(movie.rename(time="frame").expand_dims(temperature=[temperature]))
@@ -192,7 +193,9 @@ def _gain(options: argparse.Namespace, raw: xr.Dataset, fitted: list[xr.Dataset]
         rule = "Must be the file of 'dbthermal calibrate --correction-output nuc.zarr' or, only if "
         rule += "the cameras correct gain and offset themselves, --corrected-by-camera"
         raise ValueError(f"Invalid correction of gain and offset: {sources}. {rule}.")
-    return fitted[0].load() if fitted else correction.corrected_by_camera(raw)
+    gain = fitted[0].load() if fitted else correction.corrected_by_camera(raw)
+    is_part = "rows" in raw.attrs and raw.sizes["y"] < gain.sizes["y"]  # as of import --rows
+    return gain.isel(y=slice(*raw.attrs["rows"])) if is_part else gain
 
 
 def align(options: argparse.Namespace) -> dict[str, Any]:

@@ -75,7 +75,6 @@ _NUMBER: Final = 24  # place of the frame's number, in image and camera
 _FIRST_CLOCK: Final = datetime(2001, 1, 1, tzinfo=UTC).timestamp()  # clocks never set begin before
 _CONSTANTS: Final = ("planck_R1", "planck_R2", "planck_B", "planck_F", "planck_O")
 
-
 _Content = bytes | mmap
 
 
@@ -204,7 +203,7 @@ _Found = tuple[_Content, _Frame, str]
 
 
 def _walk(paths: Sequence[Path], memory: float, stack: ExitStack) -> Iterator[_Found]:
-    """Yield content, records and name of each frame of some files."""
+    """Yield content, records and name of each frame of some files; ValueError where damaged."""
     for path in paths:
         file = stack.enter_context(path.open("rb"))
         content: _Content = stack.enter_context(mmap(file.fileno(), 0, access=ACCESS_READ))
@@ -212,10 +211,13 @@ def _walk(paths: Sequence[Path], memory: float, stack: ExitStack) -> Iterator[_F
             texts.regular_file(path, int(memory))
             content = _of_jpeg(content, path.name)
         number = 0
+        at: int | None = 0
         try:
-            for records in _records(content, path.name, still=still):
-                yield content, records, f"frame {number} of '{path.name}'"
-                number += 1
+            while at is not None:
+                place = f"frame {number} of '{path.name}'"
+                records, stop = _frame(content, at, f"{place}, at byte {at}")
+                yield content, records, place
+                at, number = _following(content, at, stop, still=still), number + 1
         except ValueError as error:
             before = f" Those before it: frames=slice(0, {number})." if number else ""
             raise ValueError(f"{error}{before}") from error
@@ -361,16 +363,6 @@ def _attrs(camera: dict[str, Any], seconds: float | None = None) -> dict[str, An
         if seconds < _FIRST_CLOCK:
             implausible.append(f"date {moment:%Y-%m-%d}, as of a clock that was never set")
     return {"implausible": "; ".join(implausible), **attrs}
-
-
-def _records(content: _Content, name: str, *, still: bool) -> Iterator[_Frame]:
-    """Yield the records of each frame of a file; ValueError by frame and byte where damaged."""
-    at: int | None = 0
-    number = 0
-    while at is not None:
-        records, stop = _frame(content, at, f"frame {number} of '{name}', at byte {at}")
-        yield records
-        at, number = _following(content, at, stop, still=still), number + 1
 
 
 def _following(content: _Content, start: int, stop: int, *, still: bool) -> int | None:

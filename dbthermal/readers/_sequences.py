@@ -150,12 +150,10 @@ def sequence(path: str | Path, *, clock: Clock | None = None, memory: float = ME
     with _recording.damage_named(f"Damaged '{path.name}'", "a whole .sfmov or .hcc"):
         read = _sfmov if path.suffix.lower() == ".sfmov" else _hcc
         counts, times = read(path, memory)
-    if _recording.smoother(counts) < 0:
-        raise ValueError(f"Invalid counts of '{path.name}', bytes swapped. Must be little-endian.")
+    _recording.check_byte_order(counts, path.name)
     if times is not None:
         clock = _recording.check_times(times, "s", clock, path.name)
-    kind: Any = {"clock": clock, "format": path.suffix.lower()[1:]}
-    return _recording.clocked(counts, name=path.name, **kind)
+    return _recording.clocked(counts, clock, path.name, format=path.suffix.lower()[1:])
 
 
 def _frames(path: Path, form: np.dtype[Any], start: int, memory: float) -> npt.NDArray[Any]:

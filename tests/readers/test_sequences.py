@@ -55,7 +55,7 @@ def test_hcc(tmp_path: Path) -> None:
         ("a.sfmov", sfmov(scene()) + b"1234", r"Truncated or damaged"),
         ("a.sfmov", sfmov(scene(), kind="Flt32"), "Invalid DaType 'Flt32' .* 16-bit counts"),
         ("a.sfmov", b"Camera None\r\n" * 99, "Invalid header .* NumDPs, yPixls, xPixls and DATA"),
-        ("a.sfmov", sfmov(scene().byteswap()), "bytes swapped"),
+        ("a.sfmov", sfmov(scene().byteswap()), "with bytes swapped"),
         ("a.sfmov", b"", "Empty file 'a.sfmov'"),
         ("a.sfmov", hcc(scene()), "Invalid header of 'a.sfmov'"),
         ("a.hcc", b"", "Empty file 'a.hcc'"),
