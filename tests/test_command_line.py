@@ -584,7 +584,7 @@ import two.npz --bands a b -o x.zarr -> Invalid 1 files .* twice, with --variabl
 import two.npz two.npz --bands a b -o x.zarr -> one of the arrays .--variable. .* one of .'a', 'b'.
 separate a.tif response.zarr -o x.zarr -> No dataset 'a.tif'. Must be a zarr folder, as from: dbth
 import response.zarr -o x.zarr -> of stage 'response'. Must be of stage 'capture'
-info result.zarr scene.zarr nuc.zarr -> Invalid list of 3 arrays. Must be one file or store.
+info result.zarr scene.zarr nuc.zarr -> Invalid list of 3 arrays. Must be joined in a file
 info a.tif b.tif five.tif --clock 10 -> Unordered files: .* Must be of one camera, and rise
 record a.tif new -> Invalid session 'a.tif'. Must be YAML, as params/sessions/scene.yaml.
 record folder new -> Invalid session 'folder'. Must be YAML
@@ -630,7 +630,7 @@ import folder --bands a b --clock 10 -o x.zarr -> Invalid folder .* Must be file
 info folder -> Invalid folder 'folder', no whole zarr. Must be files: folder/.*.tif
 info nothing*.zarr -> No file or folder 'nothing.*.zarr'
 info 1714*.tif --clock 30 -> Warning: The dates of .* are 1 s apart, by --clock 0.0333 s. Must be
-info gap*.tif --clock 9 -> Warning: The numbers of 'gap8.tif to gap11.tif' leave out 1 frames
+info ../user?/gap[0-9]*.tif --clock 9 -> Warning: The numbers of 'gap8.tif to gap11.tif' leave out 1 frames
 plan gold --noise 0.03 -> Unknown material 'gold'
 export result.zarr -o out.xyz -> Must end in one of .'.csv', '.tif', '.nc', '.png'
 export result.zarr --pixel 1 1 -o curve.txt -> Must end in one of .'.csv'

@@ -34,8 +34,9 @@ def expanded(values: list[Any]) -> list[Any]:
     """Values of an argument, in place of a pattern that no shell expanded its files by numbers."""
     result = list[Any]()
     for value in values:
-        is_pattern = isinstance(value, Path) and "*" in value.name
-        files = list(value.parent.glob(value.name) if is_pattern else ())
+        is_pattern = isinstance(value, Path) and not value.exists()
+        root = Path(value.anchor if is_pattern else "")
+        files = list(root.glob(str(value.relative_to(root))) if is_pattern else ())
         files.sort(key=lambda file: ([*map(int, re.findall("[0-9]+", str(file)))], file))
         result += files or [expanded(value) if isinstance(value, list) else value]
     return result

@@ -99,7 +99,7 @@ def recording(paths: list[Path], options: Namespace, camera: int = 0) -> xr.Data
         stated["frames"], of_reader = between(options, "frames"), "frames"
     several = kind in {"FLIR", "TIFF"}  # whose files make one recording together
     if len(paths) > 1 and not several:
-        raise ValueError(f"Invalid list of {len(paths)} {kind}. Must be one file or store.")
+        raise ValueError(f"Invalid list of {len(paths)} {kind}. Must be joined in a file or store.")
     with on_disk(_room(options)):  # films that are large
         movie = reader(paths if several else paths[0], **stated)
     movie = _selected(movie, options, paths[0], of_reader) if "rows" in options else movie
