@@ -630,7 +630,7 @@ import folder --bands a b --clock 10 -o x.zarr -> Invalid folder .* Must be file
 info folder -> Invalid folder 'folder', no whole zarr. Must be files: folder/.*.tif
 info nothing*.zarr -> No file or folder 'nothing.*.zarr'
 info 1714*.tif --clock 30 -> Warning: The dates of .* are 1 s apart, by --clock 0.0333 s. Must be
-info ../user?/gap[0-9]*.tif --clock 9 -> Warning: The numbers of 'gap8.tif to gap11.tif' leave out 1 frames
+info ../user?/gap[0-9]*.tif --clock 9 -> Warning: The numbers of 'gap8.tif to gap11.tif' leave
 plan gold --noise 0.03 -> Unknown material 'gold'
 export result.zarr -o out.xyz -> Must end in one of .'.csv', '.tif', '.nc', '.png'
 export result.zarr --pixel 1 1 -o curve.txt -> Must end in one of .'.csv'
