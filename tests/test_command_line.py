@@ -15,6 +15,7 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
+import flir_files
 import h5py
 import nbformat
 import numpy as np
@@ -303,6 +304,24 @@ def test_cameras_of_two_rates_and_a_part_of_them(results: Path) -> None:
     done(results, "correct", "rows2.zarr", "nuc.zarr", "-o", "rows3.zarr")
     corrected, rows = (store.open_dataset(results / f"{it}.zarr") for it in ("corrected", "rows3"))
     np.testing.assert_array_equal(rows["counts"], corrected["counts"][:, :, 4:10])
+
+
+def test_selected_frames_have_the_times_of_all_formats(tmp_path: Path) -> None:
+    """Frames of FLIR's files count from the first of the file, by its times or by the clock."""
+    counts = flir_files.scene(80)
+    seconds = [1.5e9 + number / 8 for number in range(80)]
+    (tmp_path / "a.seq").write_bytes(flir_files.sequence(counts, seconds=seconds))
+    (tmp_path / "b.seq").write_bytes(flir_files.sequence(counts + 1, seconds=seconds))
+    np.save(tmp_path / "c.npy", counts + np.uint16(2))
+    form = ["--bands", "8-14", "9.5", "--frames", "8", "80", "--every", "2", "-o", "s.zarr"]
+    clock = ["--clock", "8", "--offset", "0"]
+    for options in (["a.seq", "b.seq"], ["a.seq", "c.npy", *clock], ["a.seq", "b.seq", *clock]):
+        done(tmp_path, "import", *options, *form, "--overwrite")
+        capture = store.open_dataset(tmp_path / "s.zarr")
+        np.testing.assert_allclose(
+            capture["exposure_time"], [np.arange(1.0, 10.0, 0.25)] * 2
+        )  # [s]
+        assert str(capture.attrs["files"]["8-14"]["start"]).startswith("2017-07-14T02:40:00")
 
 
 @pytest.mark.slow

@@ -102,6 +102,11 @@ def recording(paths: list[Path], options: Namespace, camera: int = 0) -> xr.Data
         raise ValueError(f"Invalid list of {len(paths)} {kind}. Must be joined in a file or store.")
     with on_disk(_room(options)):  # films that are large
         movie = reader(paths if several else paths[0], **stated)
+    if of_reader and (first := stated["frames"].start):  # times since the first frame of the files
+        ends = reader(paths, **{**stated, "frames": slice(0, first + 1, first)})
+        movie["exposure_time"].values[:] += (lead := ends["exposure_time"].values[1])
+        start = {"start": ends.attrs["start"]} if "start" in ends.attrs else {}
+        movie = movie.assign_coords(time=movie["time"] + lead).assign_attrs(start)
     movie = _selected(movie, options, paths[0], of_reader) if "rows" in options else movie
     return movie.assign_attrs(origin="simulated") if options.simulated else movie
 
@@ -345,12 +350,10 @@ def summary(dataset: xr.Dataset, *, everything: bool = False) -> dict[str, Any]:
     for name in ("status", "frame_flags"):
         if name in dataset and "flag_masks" in dataset[name].attrs:
             lines[f"{name}_shares"] = _shares(dataset[name])
-    places = {"frames_missing": 1, "frames_bridged": 1, "frames_lost": 1}
-    places |= {"time_offset": 6, "time_offset_std": 6}  # decimals
-    for name, decimals in places.items():
-        if attrs.get(name) is not None:
-            unit = "_s" if name.startswith("time") else ""
-            lines[f"{name}{unit}"] = np.round(attrs[name], decimals).tolist()
+    names = ("frames_missing", "frames_bridged", "frames_lost", "time_offset", "time_offset_std")
+    for name in (name for name in names if attrs.get(name) is not None):
+        unit, decimals = ("_s", 6) if name.startswith("time") else ("", 1)
+        lines[f"{name}{unit}"] = np.round(attrs[name], decimals).tolist()
     lines |= _shifts(dataset)
     # Medians over the pixels without a flag, where every band has one.
     for name, unit in (("netd", "_K"), ("emissivity", "")):

@@ -1,9 +1,9 @@
 """Demonstration; steps from a capture to a result; plan of a capture; data of the package."""
 
-import argparse
 import math
 import shutil
 import sys
+from argparse import Namespace
 from collections.abc import Iterator
 from pathlib import Path
 from shlex import quote
@@ -62,7 +62,7 @@ _OUTPUTS.update(separate="separated", complete="separated")
 """Command -> stage of what it writes, whose size follows from that of a capture."""
 
 
-def demo(options: argparse.Namespace) -> dict[str, Any]:
+def demo(options: Namespace) -> dict[str, Any]:
     """Command `demo`."""
     tifffile = optional("tifffile", "recordings")
     folder: Path = options.folder
@@ -111,7 +111,7 @@ def _demo_stacks(rig: simulation.Rig, rng: np.random.Generator, *, apart: bool) 
     return stacks
 
 
-def calibrate(options: argparse.Namespace) -> dict[str, Any]:
+def calibrate(options: Namespace) -> dict[str, Any]:
     """Command `calibrate`."""
     stated = [name for name in ("at", "blackbody", "sweep", "maker") if getattr(options, name)]
     if len(stated) != 1:
@@ -143,7 +143,7 @@ def calibrate(options: argparse.Namespace) -> dict[str, Any]:
     return summary
 
 
-def _blackbody(options: argparse.Namespace) -> xr.Dataset:
+def _blackbody(options: Namespace) -> xr.Dataset:
     """Counts of a blackbody at all temperatures."""
     frames = files.between(options, "frames", most=_SWEEP)
     if options.blackbody:
@@ -173,7 +173,7 @@ def _blackbody(options: argparse.Namespace) -> xr.Dataset:
     return counts.transpose("band", "temperature", "frame", "y", "x").sortby("temperature")
 
 
-def correct(options: argparse.Namespace) -> dict[str, Any]:
+def correct(options: Namespace) -> dict[str, Any]:
     """Command `correct`."""
     stages = {"correction": "correction"} if options.correction else {}
     raw, *fitted = files.staged(options, capture="capture|corrected", **stages)
@@ -182,7 +182,7 @@ def correct(options: argparse.Namespace) -> dict[str, Any]:
     return files.saved(correction.correct_capture(raw, gain, lazy=True, **named), options)
 
 
-def _gain(options: argparse.Namespace, raw: xr.Dataset, fitted: list[xr.Dataset]) -> xr.Dataset:
+def _gain(options: Namespace, raw: xr.Dataset, fitted: list[xr.Dataset]) -> xr.Dataset:
     """Gain and offset of each pixel: of a file, or corrected by the cameras."""
     by_camera = options.corrected_by_camera
     records = raw.attrs.get("files", {}).values()
@@ -198,7 +198,7 @@ def _gain(options: argparse.Namespace, raw: xr.Dataset, fitted: list[xr.Dataset]
     return gain.isel(y=slice(*raw.attrs["rows"])) if is_part else gain
 
 
-def align(options: argparse.Namespace) -> dict[str, Any]:
+def align(options: Namespace) -> dict[str, Any]:
     """Command `align`."""
     (corrected,) = files.staged(options, capture="corrected")
     options.register = options.register or "homography"
@@ -210,7 +210,7 @@ def align(options: argparse.Namespace) -> dict[str, Any]:
     return files.saved(alignment.align(corrected, lazy=True, **named), options)
 
 
-def _aligning(options: argparse.Namespace, capture: xr.Dataset) -> dict[str, Any]:
+def _aligning(options: Namespace, capture: xr.Dataset) -> dict[str, Any]:
     """Options of an alignment, with the offset of each band."""
     named = accepted(alignment.align, options)
     if "offset" in named:
@@ -229,7 +229,7 @@ def _aligning(options: argparse.Namespace, capture: xr.Dataset) -> dict[str, Any
     return named
 
 
-def separate(options: argparse.Namespace) -> dict[str, Any]:
+def separate(options: Namespace) -> dict[str, Any]:
     """Command `separate`."""
     # Inputs of the stages that the way needs.
     is_raw = bool(options.correction or options.corrected_by_camera)
@@ -261,7 +261,7 @@ def separate(options: argparse.Namespace) -> dict[str, Any]:
     return {str(options.output): files.summary(store.open_dataset(options.output))}
 
 
-def complete(options: argparse.Namespace) -> dict[str, Any]:
+def complete(options: Namespace) -> dict[str, Any]:
     """Command `complete`."""
     stages = {"result": "separated", "capture": "corrected", "response": "response"}
     result, source, response = (dataset.load() for dataset in files.staged(options, **stages))
@@ -269,9 +269,7 @@ def complete(options: argparse.Namespace) -> dict[str, Any]:
     return files.saved(separation.complete(result, source, response, **named), options)
 
 
-def foreseen(
-    options: argparse.Namespace, sources: list[Path], targets: list[Path]
-) -> dict[str, Any]:
+def foreseen(options: Namespace, sources: list[Path], targets: list[Path]) -> dict[str, Any]:
     """Inputs and outputs of a command with their bytes, and the memory that a separation takes."""
     inputs = dict[str, Any]()
     for path in sources:
@@ -305,7 +303,7 @@ def foreseen(
     return summary
 
 
-def plan(options: argparse.Namespace) -> dict[str, Any]:
+def plan(options: Namespace) -> dict[str, Any]:
     """Command `plan`."""
     table = emissivity.embedded_table()
     if options.materials:
@@ -353,7 +351,7 @@ def _table(
         yield "Best none: no filter tells more than the range of the temperatures does."
 
 
-def data(_: argparse.Namespace) -> dict[str, Any]:
+def data(_: Namespace) -> dict[str, Any]:
     """Command `data`."""
     table = emissivity.embedded_table()["emissivity"]
     edges = {name: (1e6 * it.lower, 1e6 * it.upper) for name, it in bands.FILTERS.items()}

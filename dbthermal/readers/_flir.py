@@ -129,7 +129,7 @@ def flir(
     frames : slice, optional
         Frames to read, not negative; of a long or damaged recording only those are looked at.
     clock : float or array_like, optional
-        Frame rate [Hz] or time of each frame [s], in place of the file's times.
+        Frame rate of the file [Hz] or time of each selected frame [s], in place of its times.
     byte_order, memory : {"little", "big"} or None, float
         Order of an image's bytes, in place of what is decided; largest memory that the counts may
         take [byte], refused before it is taken.
@@ -162,8 +162,7 @@ def flir(
             selected = islice(_walk(paths, memory, stack), wanted.start, wanted.stop, wanted.step)
         except (AttributeError, TypeError, ValueError) as error:
             raise ValueError(f"Invalid frames {frames}. Must be >= 0, and the step > 0.") from error
-        listed = [*selected]
-        if not listed:
+        if not (listed := [*selected]):
             raise ValueError(f"Invalid frames={frames} of '{name}'. Must select at least one.")
         # Images, all of the form of the first.
         form = _image(*listed[0], stated)._replace(body=b"")
@@ -190,8 +189,9 @@ def flir(
     order, by = _order(counts, form, byte_order, name)
     flags = np.where(same_number, 0, FileFlag.NUMBERS_DIFFER.value).astype(np.uint16)
     seconds = np.where(same_number, seconds, np.nan)
-    if clock is not None:
-        seconds = _recording.stamps(clock, len(counts), name)
+    if clock is not None:  # a rate is that of all frames
+        every = 1 if np.ndim(np.asarray(clock)) else wanted.step or 1
+        seconds = every * _recording.stamps(clock, len(counts), name)
     about = {"source": name, "format": f"FLIR, {form.codec}", "byte_order": order}
     about |= {"byte_order_by": by, **attrs}
     doubts = [note for note in attrs["implausible"].split("; ") if note.startswith("checksum")]
