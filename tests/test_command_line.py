@@ -149,7 +149,7 @@ def test_three_bands(tmp_path: Path) -> None:
         for step, still in zip("0123", steps, strict=True):
             np.save(tmp_path / f"{camera}{step}.npy", still)
     stated = ["--bands", *bands, "--clock", "10"]
-    offsets = ["--offset", "0", "0"]
+    offsets = ["--offset", "0", "--offset", "0"]
     done(tmp_path, "import", "a.npy", "b.npy", "c.npy", *stated, *offsets, "-o", "scene.zarr")
     kelvin = [f"{value}K" for value in sweep["temperature"].values]
     at = [f"--at {k} a{n}.npy b{n}.npy c{n}.npy" for n, k in enumerate(kelvin)]
