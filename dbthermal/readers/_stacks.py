@@ -352,8 +352,7 @@ def _stated(description: str) -> int:
     names = "".join((a or b)[0].upper() for a, b, size in stated if int(size) > 1) + "YX"
     names = names.replace("S", "Z").replace("F", "T")  # of ImageJ's slices and frames
     if shaped := description.startswith('{"shape": ['):
-        about = json.loads(description)
-        shape = about["shape"]
+        shape = (about := json.loads(description))["shape"]
         axes = shape[:-2] if all(isinstance(size, int) for size in shape) else [0]
         dims = str(about.get("axes", "YX"))
         named = zip(dims[:-2], shape, strict=False)

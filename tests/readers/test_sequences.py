@@ -143,8 +143,9 @@ def test_raw(tmp_path: Path) -> None:
         if not is_told:
             assert bare(path, shape=(32, 24)).sizes["y"] == 32  # of a scene at rest
             continue
-        with pytest.raises(ValueError, match=r"Invalid shape \(32, 24\) .*: rougher than"):
-            bare(path, shape=(32, 24))
+        for shape in ((32, 24), (16, 48)):
+            with pytest.raises(ValueError, match=r"Invalid shape .*: rougher than \(24, 32\)"):
+                bare(path, shape=shape)
     path.write_bytes(counts.astype(">u2").tobytes())
     with pytest.raises(ValueError, match=r"Invalid shape \(1000000, .* of less than 2 GB"):
         bare(path, shape=(1_000_000, 1_000_000))
