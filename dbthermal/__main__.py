@@ -270,6 +270,7 @@ def _options(argument: str, kind: str, text: str) -> dict[str, Any]:
     options: dict[str, Any] = {"type": _KINDS[name], "help": text}
     if number:
         options["nargs"] = int(number) if number.isdigit() else number
+        options |= {"action": "extend"} if number == "+" else {}  # --clock 12 --clock 10
     if argument.startswith("-"):
         values = _VALUES.get(argument, name.upper()).split()
         options["metavar"] = tuple(values) if len(values) > 1 else values[0]

@@ -49,8 +49,7 @@ def _require_same(
     """ValueError where two coordinates differ: numbers beyond rounding, all else as text."""
     if {values.dtype.kind, reference.dtype.kind} <= set("iuf"):
         actual, wanted = values.astype(np.float64), reference.astype(np.float64)
-        dtypes = (values.dtype, reference.dtype)
-        floats = [np.finfo(dtype).eps for dtype in dtypes if dtype.kind == "f"]
+        floats = [np.finfo(it.dtype).eps for it in (values, reference) if it.dtype.kind == "f"]
         tolerance = _ROUNDING * max(floats, default=0.0) * np.abs(wanted).max(initial=0.0)
         if wanted.size > 1:
             tolerance += _STEP * np.abs(np.diff(wanted)).min()

@@ -15,6 +15,7 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
+import flir_files
 import h5py
 import nbformat
 import numpy as np
@@ -148,7 +149,7 @@ def test_three_bands(tmp_path: Path) -> None:
         for step, still in zip("0123", steps, strict=True):
             np.save(tmp_path / f"{camera}{step}.npy", still)
     stated = ["--bands", *bands, "--clock", "10"]
-    offsets = ["--offset", "0", "0"]
+    offsets = ["--offset", "0", "--offset", "0"]
     done(tmp_path, "import", "a.npy", "b.npy", "c.npy", *stated, *offsets, "-o", "scene.zarr")
     kelvin = [f"{value}K" for value in sweep["temperature"].values]
     at = [f"--at {k} a{n}.npy b{n}.npy c{n}.npy" for n, k in enumerate(kelvin)]
@@ -297,6 +298,30 @@ def test_cameras_of_two_rates_and_a_part_of_them(results: Path) -> None:
     whole = store.open_dataset(results / "scene.zarr")["counts"][:, 20:120:3, 4:10]
     for name in ("part", "part2"):
         np.testing.assert_array_equal(store.open_dataset(results / f"{name}.zarr")["counts"], whole)
+    # Rows of rows take the gain and offset of these rows of the detector.
+    done(results, "import", "scene.zarr", "--rows", "2", "12", "-o", "rows.zarr")
+    done(results, "import", "rows.zarr", "--rows", "2", "8", "-o", "rows2.zarr")
+    done(results, "correct", "rows2.zarr", "nuc.zarr", "-o", "rows3.zarr")
+    corrected, rows = (store.open_dataset(results / f"{it}.zarr") for it in ("corrected", "rows3"))
+    np.testing.assert_array_equal(rows["counts"], corrected["counts"][:, :, 4:10])
+
+
+def test_selected_frames_have_the_times_of_all_formats(tmp_path: Path) -> None:
+    """Frames of FLIR's files count from the first of the file, by its times or by the clock."""
+    counts = flir_files.scene(80)
+    seconds = [1.5e9 + number / 8 for number in range(80)]
+    (tmp_path / "a.seq").write_bytes(flir_files.sequence(counts, seconds=seconds))
+    (tmp_path / "b.seq").write_bytes(flir_files.sequence(counts + 1, seconds=seconds))
+    np.save(tmp_path / "c.npy", counts + np.uint16(2))
+    form = ["--bands", "8-14", "9.5", "--frames", "8", "80", "--every", "2", "-o", "s.zarr"]
+    clock = ["--clock", "8", "--offset", "0"]
+    for options in (["a.seq", "b.seq"], ["a.seq", "c.npy", *clock], ["a.seq", "b.seq", *clock]):
+        done(tmp_path, "import", *options, *form, "--overwrite")
+        capture = store.open_dataset(tmp_path / "s.zarr")
+        np.testing.assert_allclose(
+            capture["exposure_time"], [np.arange(1.0, 10.0, 0.25)] * 2
+        )  # [s]
+        assert str(capture.attrs["files"]["8-14"]["start"]).startswith("2017-07-14T02:40:00")
 
 
 @pytest.mark.slow
@@ -578,7 +603,7 @@ import two.npz --bands a b -o x.zarr -> Invalid 1 files .* twice, with --variabl
 import two.npz two.npz --bands a b -o x.zarr -> one of the arrays .--variable. .* one of .'a', 'b'.
 separate a.tif response.zarr -o x.zarr -> No dataset 'a.tif'. Must be a zarr folder, as from: dbth
 import response.zarr -o x.zarr -> of stage 'response'. Must be of stage 'capture'
-info result.zarr scene.zarr nuc.zarr -> Invalid list of 3 arrays. Must be one file or store.
+info result.zarr scene.zarr nuc.zarr -> Invalid list of 3 arrays. Must be joined in a file
 info a.tif b.tif five.tif --clock 10 -> Unordered files: .* Must be of one camera, and rise
 record a.tif new -> Invalid session 'a.tif'. Must be YAML, as params/sessions/scene.yaml.
 record folder new -> Invalid session 'folder'. Must be YAML
@@ -612,6 +637,9 @@ separate scene.zarr response.zarr --correction nuc.zarr --corrected-by-camera -o
  -> Invalid correction of gain and offset: both
 {EXCHANGED} -> Warning: Counts of bands .* are files of the bands exchanged
 calibrate --at 5C --clock 10 -o x.zarr -> Invalid 0 files
+calibrate --blackbody response.zarr -o x.zarr --correction-output y.zarr
+ -> Unused option --correction-output. Must be left out: 'response.zarr' has no pixels
+info a*.tif --clock 10 -> Warning: 'a.tif to a70.tif' have .200, 16, 16, 16, 16. frames. Must be
 calibrate -o x.zarr -> Missing source. Must be one of --at, --blackbody
 calibrate --at 5C a5.tif + b5.tif --bands a b --clock 9 -o x.zarr -> Invalid blackbody frames of 1
 demo x --side -> unrecognized arguments: --side Did you mean '--side-by-side'
@@ -621,7 +649,7 @@ import folder --bands a b --clock 10 -o x.zarr -> Invalid folder .* Must be file
 info folder -> Invalid folder 'folder', no whole zarr. Must be files: folder/.*.tif
 info nothing*.zarr -> No file or folder 'nothing.*.zarr'
 info 1714*.tif --clock 30 -> Warning: The dates of .* are 1 s apart, by --clock 0.0333 s. Must be
-info gap*.tif --clock 9 -> Warning: The numbers of 'gap8.tif to gap11.tif' leave out 1 frames
+info ../user?/gap[0-9]*.tif --clock 9 -> Warning: The numbers of 'gap8.tif to gap11.tif' leave
 plan gold --noise 0.03 -> Unknown material 'gold'
 export result.zarr -o out.xyz -> Must end in one of .'.csv', '.tif', '.nc', '.png'
 export result.zarr --pixel 1 1 -o curve.txt -> Must end in one of .'.csv'

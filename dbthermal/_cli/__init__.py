@@ -34,12 +34,11 @@ def expanded(values: list[Any]) -> list[Any]:
     """Values of an argument, in place of a pattern that no shell expanded its files by numbers."""
     result = list[Any]()
     for value in values:
-        is_pattern = isinstance(value, Path) and "*" in value.name
-        files = value.parent.glob(value.name) if is_pattern else ()
-        parted = [re.split("([0-9]+)", str(file)) for file in files]
-        parted.sort(key=lambda words: [*map(int, words[1::2]), *words])
-        listed = [expanded(value)] if isinstance(value, list) else [value]
-        result += [Path("".join(words)) for words in parted] or listed
+        is_pattern = isinstance(value, Path) and not value.exists()
+        root = Path(value.anchor if is_pattern else "")
+        files = list(root.glob(str(value.relative_to(root))) if is_pattern else ())
+        files.sort(key=lambda file: ([*map(int, re.findall("[0-9]+", str(file)))], file))
+        result += files or [expanded(value) if isinstance(value, list) else value]
     return result
 
 
@@ -105,9 +104,8 @@ def sources_and_targets(options: Namespace) -> tuple[list[Path], list[Path]]:
             label = f"Invalid output '{path}': an input or another output lies there"
             raise ValueError(f"{label}. Must be another place.")
         taken.append(place)
-        if (path.exists() or path.is_symlink()) and not getattr(
-            options, "overwrite", path.is_dir()
-        ):
+        may_exist = getattr(options, "overwrite", path.is_dir())
+        if (path.exists() or path.is_symlink()) and not may_exist:
             rule = "new, or --overwrite" if "overwrite" in options else "new, or a folder"
             raise FileExistsError(f"There is something at '{path}'. Must be {rule}.")
         if "output" in options and not path.name.endswith(end):
@@ -138,7 +136,7 @@ def lines_of(summary: Any, indent: str = "") -> Iterator[str]:
 
 def suggestion(reason: str) -> str:
     """Question after the name that is most like an unknown one, of those that a message lists."""
-    unknown = re.search(r"'([^']+)'.*(?:Must be one of|choose from)\s(.*)", reason)
+    unknown = re.search(r"'([^']+)'.*(?:Must be one of (?=[\[(])|choose from )(.*)", reason)
     if unknown is None or "Did you mean" in reason:
         return ""
     wrong, names = unknown.group(1), re.findall(r"'([^']+)'", unknown.group(2))

@@ -1,7 +1,7 @@
 """Stores and files of the commands: read, written, and summarised."""
 
-import argparse
 import re
+from argparse import Namespace
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from inspect import Parameter, signature
@@ -57,7 +57,7 @@ def opened(path: Path) -> xr.Dataset:
     return recording.open_capture(path)
 
 
-def staged(options: argparse.Namespace, **stages: str) -> list[xr.Dataset]:
+def staged(options: Namespace, **stages: str) -> list[xr.Dataset]:
     """Stores that arguments name, each of a stage of `schema`, or of one of several: ``a|b``."""
     datasets = {name: opened(getattr(options, name)) for name in stages}
     actual = {name: stage_of(dataset) for name, dataset in datasets.items()}
@@ -72,7 +72,7 @@ def staged(options: argparse.Namespace, **stages: str) -> list[xr.Dataset]:
     return [*datasets.values()]
 
 
-def kind_of(path: Path, options: argparse.Namespace) -> str:
+def kind_of(path: Path, options: Namespace) -> str:
     """Kind of a recording's file: by its first bytes, its suffix, or a shape that is stated."""
     reader, suffix, raw = formats.reader_of(path), path.suffix.lower(), options.shape is not None
     kinds = [kind for kind, (function, _) in READERS.items() if function.__name__ == reader]
@@ -87,7 +87,7 @@ def kind_of(path: Path, options: argparse.Namespace) -> str:
     return kinds[0]
 
 
-def recording(paths: list[Path], options: argparse.Namespace, camera: int = 0) -> xr.Dataset:
+def recording(paths: list[Path], options: Namespace, camera: int = 0) -> xr.Dataset:
     """Recording of one camera, by the kind of its files, with its origin; large ones on disk."""
     kind = kind_of(paths[0], options)
     reader, _ = READERS[kind]
@@ -97,19 +97,21 @@ def recording(paths: list[Path], options: argparse.Namespace, camera: int = 0) -
     of_reader = ""  # what the reader selects, not all at hand
     if stated.pop("frames", None) and "rows" in options:
         stated["frames"], of_reader = between(options, "frames"), "frames"
-    # Files of the kinds that make one recording together.
-    several = kind in {"FLIR", "TIFF"}
+    several = kind in {"FLIR", "TIFF"}  # whose files make one recording together
     if len(paths) > 1 and not several:
-        raise ValueError(f"Invalid list of {len(paths)} {kind}. Must be one file or store.")
+        raise ValueError(f"Invalid list of {len(paths)} {kind}. Must be joined in a file or store.")
     with on_disk(_room(options)):  # films that are large
         movie = reader(paths if several else paths[0], **stated)
+    if of_reader and (first := stated["frames"].start):  # times since the first frame of the files
+        ends = reader(paths, **{**stated, "frames": slice(0, first + 1, first)})
+        movie["exposure_time"].values[:] += (lead := ends["exposure_time"].values[1])
+        start = {"start": ends.attrs["start"]} if "start" in ends.attrs else {}
+        movie = movie.assign_coords(time=movie["time"] + lead).assign_attrs(start)
     movie = _selected(movie, options, paths[0], of_reader) if "rows" in options else movie
     return movie.assign_attrs(origin="simulated") if options.simulated else movie
 
 
-def _selected(
-    movie: xr.Dataset, options: argparse.Namespace, path: Path, of_reader: str = ""
-) -> xr.Dataset:
+def _selected(movie: xr.Dataset, options: Namespace, path: Path, of_reader: str = "") -> xr.Dataset:
     """Selected frames and rows; ValueError if some are not in the file or store."""
     for name, dim in (("frames", "time"), ("rows", "y")):
         part = between(options, name)
@@ -118,7 +120,7 @@ def _selected(
     return movie
 
 
-def check_all(number: int, options: argparse.Namespace, name: str, label: str) -> None:
+def check_all(number: int, options: Namespace, name: str, label: str) -> None:
     """Raise ValueError if fewer frames or rows than are selected are there."""
     ends, part = vars(options)[name] or [], between(options, name)
     if number < (wanted := len(range(part.start, part.stop or 0, part.step))):
@@ -127,7 +129,7 @@ def check_all(number: int, options: argparse.Namespace, name: str, label: str) -
 
 
 def _arguments(
-    reader: Callable[..., xr.Dataset], options: argparse.Namespace, file: str, camera: int
+    reader: Callable[..., xr.Dataset], options: Namespace, file: str, camera: int
 ) -> dict[str, Any]:
     """Arguments of a reader, by the options of the same names; ValueError if one is missing."""
     parameters, stated = signature(reader).parameters, accepted(reader, options)
@@ -146,7 +148,7 @@ def _arguments(
     return stated
 
 
-def between(options: argparse.Namespace, name: str, most: int | None = None) -> slice:
+def between(options: Namespace, name: str, most: int | None = None) -> slice:
     """Frames or rows that are selected: the first N, or from A up to B; every so many frames."""
     ends: list[int] = vars(options).get(name) or []
     first, end = (ends[0] if len(ends) > 1 else 0), (ends[-1] if ends else most)
@@ -159,10 +161,10 @@ def between(options: argparse.Namespace, name: str, most: int | None = None) -> 
     return slice(first, end, every)
 
 
-def capture(paths: list[Path], options: argparse.Namespace, offset: Any) -> xr.Dataset:
+def capture(paths: list[Path], options: Namespace, offset: Any) -> xr.Dataset:
     """Capture of two bands or more: a store, or the files of each camera, with '+' between."""
     if len(paths) == 1 and _is_store(paths[0]):
-        return staged(argparse.Namespace(capture=paths[0]), capture="capture|corrected")[0]
+        return staged(Namespace(capture=paths[0]), capture="capture|corrected")[0]
     number, cameras = len(options.bands or "ab"), _cameras(paths, options.bands or "ab")
     if len(cameras) < 2 or paths.count(PLUS) not in {0, len(cameras) - 1}:
         label = f"Invalid {len(paths)} files {[*map(str, paths[:3])]}: of which camera is not clear"
@@ -189,19 +191,22 @@ def _cameras(paths: list[Path], bands: Sequence[str] = "ab") -> list[list[Path]]
     return [[*group] for is_plus, group in groupby(paths, PLUS.__eq__) if not is_plus]
 
 
-def _room(options: argparse.Namespace) -> Path:
+def _room(options: Namespace) -> Path:
     """Folder for films on disk: beside the output, or that of the system."""
     folder: Path = (vars(options).get("output") or Path(gettempdir(), "film")).absolute().parent
     return folder if folder.is_dir() else Path(gettempdir())
 
 
-def make_capture(options: argparse.Namespace) -> dict[str, Any]:
+def make_capture(options: Namespace) -> dict[str, Any]:
     """Command `import`."""
     from dbthermal import separation  # noqa: PLC0415 - takes long
 
     scene = capture(options.files, options, options.offset)
     if options.files[0].is_dir() and len(options.files) == 1:
         scene = _selected(scene, options, options.files[0])
+    if options.rows:  # of the detector, by which `correct` selects the rows of its correction
+        above = scene.attrs.get("rows", [0])[0]
+        scene = scene.assign_attrs(rows=[above + row for row in options.rows])
     # What speaks against separating it later.
     stamps = scene.get("exposure_time", scene["time"])
     lengths = np.atleast_1d(stamps.max("time") - stamps.min("time"))
@@ -215,9 +220,7 @@ def make_capture(options: argparse.Namespace) -> dict[str, Any]:
     return saved(scene, options)
 
 
-def saved(
-    result: xr.Dataset, options: argparse.Namespace, path: Path | None = None
-) -> dict[str, Any]:
+def saved(result: xr.Dataset, options: Namespace, path: Path | None = None) -> dict[str, Any]:
     """Save a result with its provenance, a capture by rows, which may be lazy, and describe it."""
     path, blocks = path or options.output, [slice(None)]
     if "counts" in result and result["counts"].ndim == 4:
@@ -226,7 +229,7 @@ def saved(
     return {str(path): summary(store.open_dataset(path))}
 
 
-def provenance(options: argparse.Namespace) -> dict[str, Any]:
+def provenance(options: Namespace) -> dict[str, Any]:
     """Provenance of a command: its options, and the checksums of what it reads."""
     parameters, inputs = dict[str, Any](), dict[str, Path]()
     for name, value in vars(options).items():
@@ -238,14 +241,14 @@ def provenance(options: argparse.Namespace) -> dict[str, Any]:
     return store.provenance(parameters, inputs)
 
 
-def info(options: argparse.Namespace) -> dict[str, Any]:
+def info(options: Namespace) -> dict[str, Any]:
     """Command `info`."""
     cameras = _cameras(options.files)
     keys = [f"{it[0]}{f' ({n + 1})' * (cameras.count(it) > 1)}" for n, it in enumerate(cameras)]
     return {key: _described(cameras[n], options, n) for n, key in enumerate(keys)}
 
 
-def _described(paths: list[Path], options: argparse.Namespace, camera: int) -> dict[str, Any]:
+def _described(paths: list[Path], options: Namespace, camera: int) -> dict[str, Any]:
     """Summary of a store, or of a camera's recording; its sizes even without a clock."""
     if len(paths) == 1 and _is_store(paths[0]) and options.unit is None:
         return summary(opened(paths[0]), everything=True)
@@ -254,7 +257,7 @@ def _described(paths: list[Path], options: argparse.Namespace, camera: int) -> d
     except ValueError as error:
         if options.clock is not None or not re.match("Missing (--)?clock", str(error)):
             raise
-    lines = _described(paths, argparse.Namespace(**{**vars(options), "clock": [1.0]}), camera)
+    lines = _described(paths, Namespace(**{**vars(options), "clock": [1.0]}), camera)
     lines = {name: value for name, value in lines.items() if name not in _BY_CLOCK}
     return lines | {"clock": "not in the file: state the frame rate by --clock"}
 
@@ -270,7 +273,7 @@ def _is_store(path: Path) -> bool:
     return "provenance" in text or "frames_written" in text or '"attributes"' not in text
 
 
-def refuse_unused(options: argparse.Namespace, arguments: Sequence[str]) -> None:
+def refuse_unused(options: Namespace, arguments: Sequence[str]) -> None:
     """Refuse an option that is stated and has no effect."""
     stated = {argument.partition("=")[0] for argument in arguments}
     for reason, names in _unused(options).items():
@@ -279,7 +282,7 @@ def refuse_unused(options: argparse.Namespace, arguments: Sequence[str]) -> None
                 raise ValueError(f"Unused option {flag}. Must be left out {reason}.")
 
 
-def _unused(options: argparse.Namespace) -> dict[str, str]:
+def _unused(options: Namespace) -> dict[str, str]:
     """Options of a command that have no effect, by the reason."""
     if options.command in {"import", "info", "calibrate"}:
         return _of_files(options)
@@ -299,7 +302,7 @@ def _unused(options: argparse.Namespace) -> dict[str, str]:
     return aligned | alone
 
 
-def _of_files(options: argparse.Namespace) -> dict[str, str]:
+def _of_files(options: Namespace) -> dict[str, str]:
     """Options that neither the files of a command nor its other source take."""
     # Kinds of the files; a folder alone is a store, unless it is read as another program's.
     kinds, foreign = set[str](), options.command == "info" and options.unit is not None
@@ -347,12 +350,10 @@ def summary(dataset: xr.Dataset, *, everything: bool = False) -> dict[str, Any]:
     for name in ("status", "frame_flags"):
         if name in dataset and "flag_masks" in dataset[name].attrs:
             lines[f"{name}_shares"] = _shares(dataset[name])
-    places = {"frames_missing": 1, "frames_bridged": 1, "frames_lost": 1}
-    places |= {"time_offset": 6, "time_offset_std": 6}  # decimals
-    for name, decimals in places.items():
-        if attrs.get(name) is not None:
-            unit = "_s" if name.startswith("time") else ""
-            lines[f"{name}{unit}"] = np.round(attrs[name], decimals).tolist()
+    names = ("frames_missing", "frames_bridged", "frames_lost", "time_offset", "time_offset_std")
+    for name in (name for name in names if attrs.get(name) is not None):
+        unit, decimals = ("_s", 6) if name.startswith("time") else ("", 1)
+        lines[f"{name}{unit}"] = np.round(attrs[name], decimals).tolist()
     lines |= _shifts(dataset)
     # Medians over the pixels without a flag, where every band has one.
     for name, unit in (("netd", "_K"), ("emissivity", "")):

@@ -1,9 +1,9 @@
 """Demonstration; steps from a capture to a result; plan of a capture; data of the package."""
 
-import argparse
 import math
 import shutil
 import sys
+from argparse import Namespace
 from collections.abc import Iterator
 from pathlib import Path
 from shlex import quote
@@ -62,12 +62,11 @@ _OUTPUTS.update(separate="separated", complete="separated")
 """Command -> stage of what it writes, whose size follows from that of a capture."""
 
 
-def demo(options: argparse.Namespace) -> dict[str, Any]:
+def demo(options: Namespace) -> dict[str, Any]:
     """Command `demo`."""
     tifffile = optional("tifffile", "recordings")
     folder: Path = options.folder
-    rig, rng = simulation.Rig(), np.random.default_rng(1)
-    stacks = _demo_stacks(rig, rng, apart=options.side_by_side)
+    stacks = _demo_stacks(simulation.Rig(), np.random.default_rng(1), apart=options.side_by_side)
     # All or nothing: a folder that has one of the files is left as it is.
     paths = {folder / f"{name}.tif": stack for name, stack in stacks.items()}
     for path in (path for path in paths if path.exists()):
@@ -112,7 +111,7 @@ def _demo_stacks(rig: simulation.Rig, rng: np.random.Generator, *, apart: bool) 
     return stacks
 
 
-def calibrate(options: argparse.Namespace) -> dict[str, Any]:
+def calibrate(options: Namespace) -> dict[str, Any]:
     """Command `calibrate`."""
     stated = [name for name in ("at", "blackbody", "sweep", "maker") if getattr(options, name)]
     if len(stated) != 1:
@@ -127,6 +126,9 @@ def calibrate(options: argparse.Namespace) -> dict[str, Any]:
     if "frame" in blackbody.dims:
         blackbody = correction.blackbody_statistics(blackbody)
     fitted = correction.fit_correction(blackbody) if "y" in blackbody.dims else None
+    if fitted is None and options.correction_output:
+        rule = f"Must be left out: '{options.blackbody}' has no pixels"
+        raise ValueError(f"Unused option --correction-output. {rule}.")
     counts = blackbody["counts"] if fitted is None else fitted["level"]
     accuracies |= accepted(calibration.fit_response, options)
     response = calibration.fit_response(counts, blackbody.get("noise"), **accuracies)
@@ -141,7 +143,7 @@ def calibrate(options: argparse.Namespace) -> dict[str, Any]:
     return summary
 
 
-def _blackbody(options: argparse.Namespace) -> xr.Dataset:
+def _blackbody(options: Namespace) -> xr.Dataset:
     """Counts of a blackbody at all temperatures."""
     frames = files.between(options, "frames", most=_SWEEP)
     if options.blackbody:
@@ -156,9 +158,8 @@ def _blackbody(options: argparse.Namespace) -> xr.Dataset:
             raise ValueError(f"Invalid --at {temperature}. Must begin with a temperature: 20C.")
         offset = [0.0] * (len(options.bands or "ab") - 1)  # nothing moves: any will do
         still = files.capture(paths, options, offset)
-        good = np.arange(still.sizes["time"])
-        if "exposure_time" in still:  # padded and damaged frames have none
-            good = np.flatnonzero(still["exposure_time"].notnull().all("band"))
+        stamps = still.get("exposure_time", still["time"].expand_dims("band"))
+        good = np.flatnonzero(stamps.notnull().all("band"))  # padded and damaged frames have none
         files.check_all(good[frames].size, options, "frames", f"the blackbody at {temperature:g} K")
         movie = still[["counts"]].isel(time=good[frames]).load().drop_vars("time")
         movies.append(movie.rename(time="frame").expand_dims(temperature=[temperature]))
@@ -172,7 +173,7 @@ def _blackbody(options: argparse.Namespace) -> xr.Dataset:
     return counts.transpose("band", "temperature", "frame", "y", "x").sortby("temperature")
 
 
-def correct(options: argparse.Namespace) -> dict[str, Any]:
+def correct(options: Namespace) -> dict[str, Any]:
     """Command `correct`."""
     stages = {"correction": "correction"} if options.correction else {}
     raw, *fitted = files.staged(options, capture="capture|corrected", **stages)
@@ -181,7 +182,7 @@ def correct(options: argparse.Namespace) -> dict[str, Any]:
     return files.saved(correction.correct_capture(raw, gain, lazy=True, **named), options)
 
 
-def _gain(options: argparse.Namespace, raw: xr.Dataset, fitted: list[xr.Dataset]) -> xr.Dataset:
+def _gain(options: Namespace, raw: xr.Dataset, fitted: list[xr.Dataset]) -> xr.Dataset:
     """Gain and offset of each pixel: of a file, or corrected by the cameras."""
     by_camera = options.corrected_by_camera
     records = raw.attrs.get("files", {}).values()
@@ -192,10 +193,12 @@ def _gain(options: argparse.Namespace, raw: xr.Dataset, fitted: list[xr.Dataset]
         rule = "Must be the file of 'dbthermal calibrate --correction-output nuc.zarr' or, only if "
         rule += "the cameras correct gain and offset themselves, --corrected-by-camera"
         raise ValueError(f"Invalid correction of gain and offset: {sources}. {rule}.")
-    return fitted[0].load() if fitted else correction.corrected_by_camera(raw)
+    gain = fitted[0].load() if fitted else correction.corrected_by_camera(raw)
+    is_part = "rows" in raw.attrs and raw.sizes["y"] < gain.sizes["y"]  # as of import --rows
+    return gain.isel(y=slice(*raw.attrs["rows"])) if is_part else gain
 
 
-def align(options: argparse.Namespace) -> dict[str, Any]:
+def align(options: Namespace) -> dict[str, Any]:
     """Command `align`."""
     (corrected,) = files.staged(options, capture="corrected")
     options.register = options.register or "homography"
@@ -207,7 +210,7 @@ def align(options: argparse.Namespace) -> dict[str, Any]:
     return files.saved(alignment.align(corrected, lazy=True, **named), options)
 
 
-def _aligning(options: argparse.Namespace, capture: xr.Dataset) -> dict[str, Any]:
+def _aligning(options: Namespace, capture: xr.Dataset) -> dict[str, Any]:
     """Options of an alignment, with the offset of each band."""
     named = accepted(alignment.align, options)
     if "offset" in named:
@@ -226,7 +229,7 @@ def _aligning(options: argparse.Namespace, capture: xr.Dataset) -> dict[str, Any
     return named
 
 
-def separate(options: argparse.Namespace) -> dict[str, Any]:
+def separate(options: Namespace) -> dict[str, Any]:
     """Command `separate`."""
     # Inputs of the stages that the way needs.
     is_raw = bool(options.correction or options.corrected_by_camera)
@@ -258,7 +261,7 @@ def separate(options: argparse.Namespace) -> dict[str, Any]:
     return {str(options.output): files.summary(store.open_dataset(options.output))}
 
 
-def complete(options: argparse.Namespace) -> dict[str, Any]:
+def complete(options: Namespace) -> dict[str, Any]:
     """Command `complete`."""
     stages = {"result": "separated", "capture": "corrected", "response": "response"}
     result, source, response = (dataset.load() for dataset in files.staged(options, **stages))
@@ -266,9 +269,7 @@ def complete(options: argparse.Namespace) -> dict[str, Any]:
     return files.saved(separation.complete(result, source, response, **named), options)
 
 
-def foreseen(
-    options: argparse.Namespace, sources: list[Path], targets: list[Path]
-) -> dict[str, Any]:
+def foreseen(options: Namespace, sources: list[Path], targets: list[Path]) -> dict[str, Any]:
     """Inputs and outputs of a command with their bytes, and the memory that a separation takes."""
     inputs = dict[str, Any]()
     for path in sources:
@@ -302,7 +303,7 @@ def foreseen(
     return summary
 
 
-def plan(options: argparse.Namespace) -> dict[str, Any]:
+def plan(options: Namespace) -> dict[str, Any]:
     """Command `plan`."""
     table = emissivity.embedded_table()
     if options.materials:
@@ -350,7 +351,7 @@ def _table(
         yield "Best none: no filter tells more than the range of the temperatures does."
 
 
-def data(_: argparse.Namespace) -> dict[str, Any]:
+def data(_: Namespace) -> dict[str, Any]:
     """Command `data`."""
     table = emissivity.embedded_table()["emissivity"]
     edges = {name: (1e6 * it.lower, 1e6 * it.upper) for name, it in bands.FILTERS.items()}

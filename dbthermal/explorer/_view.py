@@ -10,7 +10,7 @@ from typing import Any, Final, Literal, get_args
 import numpy as np
 import xarray as xr
 
-from dbthermal import _text, schema
+from dbthermal import _numbers, _text, schema
 from dbthermal import response as responses
 from dbthermal._arrays import Array, Mask, stride
 from dbthermal.explorer import _films
@@ -100,11 +100,11 @@ class View:
         self.shape: tuple[int, int] = film.shape[1], film.shape[2]
         shown = self.data if self.capture is None else self.capture
         schema.require(events, Mapping, "events")
-        stated = {name: float(moment) for name, moment in events.items()}
+        stated = {
+            name: _numbers.real_number(f"time [s] of the event {name!r}", moment, _numbers.FINITE)
+            for name, moment in events.items()
+        }
         self.events = _films.marks(shown, self.time) | stated
-        for name, moment in self.events.items():
-            if not np.isfinite(moment):
-                raise ValueError(f"Invalid time {moment} s of the event {name!r}. Must be finite.")
 
     def pane(self, name: str, *box: slice) -> Pane:
         """Pane by its name, or of a box of it, copied to be read quickly; ValueError if unknown."""

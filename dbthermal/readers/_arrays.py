@@ -28,17 +28,17 @@ from dbthermal import _numbers, _text, schema
 from dbthermal.readers import _formats, _recording, _variables
 from dbthermal.readers._recording import MEMORY, Clock
 
+# Names of times, perhaps with their unit: of an array beside another, and of a dim or array.
+_BESIDE: Final = re.compile("((frame_?)?time(s|_?stamps?)?|t(?=_))(_(s|ms|us|ns))?", re.IGNORECASE)
+_TIMES: Final = re.compile(f"{_BESIDE.pattern}|t", re.IGNORECASE)
 # Names of dims by their place, and dims of an array without names, in any case of letters.
-_DIMS: Final = ("time|t|frames?|images?", "y|rows?|height", "x|col(umn)?s?|width")
+_DIMS: Final = (f"{_TIMES.pattern}|frames?|images?", "y|rows?|height", "x|col(umn)?s?|width")
 _WITHOUT_NAME: Final = r"||None|(phony_)?dim_\d+"
 _NEUTRAL: Final = {"scale_factor": 1, "scale": 1, "slope": 1, "add_offset": 0, "intercept": 0}
 _ATTRIBUTES: Final = (
     *("units", "unit", *_NEUTRAL, "_FillValue", "missing_value", "origin", "_Unsigned"),
     *("long_name", "standard_name"),
 )
-# Names of times, perhaps with their unit: of a dim, and of an array beside another.
-_BESIDE: Final = re.compile("(?i)((frame_?)?time(s|_?stamps?)?|t(?=_))(_(s|ms|us|ns))?")
-_TIMES: Final = re.compile(f"{_BESIDE.pattern}|t")
 _MOMENT: Final = 40  # longest text of a moment [character]
 _OBJECTS, _DEPTH = 4096, 32  # of a file of HDF5; one with more takes minutes to list
 _LONGEST: Final = 2**10  # of a time [byte]; longer text, as a table in each place, is none
@@ -112,20 +112,15 @@ def array(
         for line in lines.items():
             seconds = _seconds(line, values.shape[0], clock, label, path)
             clock = seconds if clock is None else clock
-        if clock is None:
-            _recording.stamps(clock, 0, label)  # refuses it
+        stamps = _recording.stamps(clock, values.shape[0], label)
         read = _read(values, path) if is_file else _recording.film(values)
     counts = read.view(np.uint16)
     # The numbers: byte order, and values that stand for missing counts.
-    judged = is_file and any(np.any(frame & 0xFF) for frame in counts)
-    if judged and _recording.smoother(counts) < 0:  # as after a flipped bit of the header
-        rule = "rougher than with bytes swapped. Must be in the byte order that is stated"
-        raise ValueError(f"Invalid counts of '{label}': {rule}.")
+    _recording.check_byte_order(counts, label)
     fills = [attributes[name] for name in ("_FillValue", "missing_value") if name in attributes]
     fills = [float(fill) % 2**16 for fill in fills] if read.dtype.kind == "i" else fills
     _recording.check_present(counts, fills, label)
-    assert clock is not None
-    return _recording.clocked(counts, clock, label, format="array", **schema.origin(attributes))
+    return _recording.clocked(counts, stamps, label, format="array", **schema.origin(attributes))
 
 
 def _checked(values: Any, label: str, unit: str) -> dict[str, Any]:
@@ -189,7 +184,9 @@ def _are_times(name: object, values: Any) -> bool:
 
 def _attribute(values: Any, name: str) -> Any:
     """Attribute of an array, None if missing; ValueError for a list, which may take any memory."""
-    attrs = getattr(values, "attrs", {})
+    attrs = getattr(values, "attrs", None)
+    if attrs is None:  # of a variable of netCDF4, or a quantity with its unit
+        attrs = {name: getattr(values, name)} if hasattr(values, name) else {}
     if (name := next((key for key in attrs if str(key).lower() == name.lower()), "")) == "":
         return None
     if hasattr(attrs, "get_id") and math.prod(attrs.get_id(name).shape) > 1:

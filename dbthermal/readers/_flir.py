@@ -75,7 +75,6 @@ _NUMBER: Final = 24  # place of the frame's number, in image and camera
 _FIRST_CLOCK: Final = datetime(2001, 1, 1, tzinfo=UTC).timestamp()  # clocks never set begin before
 _CONSTANTS: Final = ("planck_R1", "planck_R2", "planck_B", "planck_F", "planck_O")
 
-
 _Content = bytes | mmap
 
 
@@ -130,7 +129,7 @@ def flir(
     frames : slice, optional
         Frames to read, not negative; of a long or damaged recording only those are looked at.
     clock : float or array_like, optional
-        Frame rate [Hz] or time of each frame [s], in place of the file's times.
+        Frame rate of the file [Hz] or time of each selected frame [s], in place of its times.
     byte_order, memory : {"little", "big"} or None, float
         Order of an image's bytes, in place of what is decided; largest memory that the counts may
         take [byte], refused before it is taken.
@@ -163,8 +162,7 @@ def flir(
             selected = islice(_walk(paths, memory, stack), wanted.start, wanted.stop, wanted.step)
         except (AttributeError, TypeError, ValueError) as error:
             raise ValueError(f"Invalid frames {frames}. Must be >= 0, and the step > 0.") from error
-        listed = [*selected]
-        if not listed:
+        if not (listed := [*selected]):
             raise ValueError(f"Invalid frames={frames} of '{name}'. Must select at least one.")
         # Images, all of the form of the first.
         form = _image(*listed[0], stated)._replace(body=b"")
@@ -191,8 +189,9 @@ def flir(
     order, by = _order(counts, form, byte_order, name)
     flags = np.where(same_number, 0, FileFlag.NUMBERS_DIFFER.value).astype(np.uint16)
     seconds = np.where(same_number, seconds, np.nan)
-    if clock is not None:
-        seconds = _recording.stamps(clock, len(counts), name)
+    if clock is not None:  # a rate is that of all frames
+        every = 1 if np.ndim(np.asarray(clock)) else wanted.step or 1
+        seconds = every * _recording.stamps(clock, len(counts), name)
     about = {"source": name, "format": f"FLIR, {form.codec}", "byte_order": order}
     about |= {"byte_order_by": by, **attrs}
     doubts = [note for note in attrs["implausible"].split("; ") if note.startswith("checksum")]
@@ -204,7 +203,7 @@ _Found = tuple[_Content, _Frame, str]
 
 
 def _walk(paths: Sequence[Path], memory: float, stack: ExitStack) -> Iterator[_Found]:
-    """Yield content, records and name of each frame of some files."""
+    """Yield content, records and name of each frame of some files; ValueError where damaged."""
     for path in paths:
         file = stack.enter_context(path.open("rb"))
         content: _Content = stack.enter_context(mmap(file.fileno(), 0, access=ACCESS_READ))
@@ -212,10 +211,13 @@ def _walk(paths: Sequence[Path], memory: float, stack: ExitStack) -> Iterator[_F
             texts.regular_file(path, int(memory))
             content = _of_jpeg(content, path.name)
         number = 0
+        at: int | None = 0
         try:
-            for records in _records(content, path.name, still=still):
-                yield content, records, f"frame {number} of '{path.name}'"
-                number += 1
+            while at is not None:
+                place = f"frame {number} of '{path.name}'"
+                records, stop = _frame(content, at, f"{place}, at byte {at}")
+                yield content, records, place
+                at, number = _following(content, at, stop, still=still), number + 1
         except ValueError as error:
             before = f" Those before it: frames=slice(0, {number})." if number else ""
             raise ValueError(f"{error}{before}") from error
@@ -361,16 +363,6 @@ def _attrs(camera: dict[str, Any], seconds: float | None = None) -> dict[str, An
         if seconds < _FIRST_CLOCK:
             implausible.append(f"date {moment:%Y-%m-%d}, as of a clock that was never set")
     return {"implausible": "; ".join(implausible), **attrs}
-
-
-def _records(content: _Content, name: str, *, still: bool) -> Iterator[_Frame]:
-    """Yield the records of each frame of a file; ValueError by frame and byte where damaged."""
-    at: int | None = 0
-    number = 0
-    while at is not None:
-        records, stop = _frame(content, at, f"frame {number} of '{name}', at byte {at}")
-        yield records
-        at, number = _following(content, at, stop, still=still), number + 1
 
 
 def _following(content: _Content, start: int, stop: int, *, still: bool) -> int | None:

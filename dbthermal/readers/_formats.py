@@ -18,8 +18,9 @@ _MAGIC: Final = (  # first bytes of a format: place, bytes, and its name
     *((0, b"\xff\xd8\xff", "JPEG"), (0, b"\x89PNG\r\n\x1a\n", "PNG")),
     *((0, b"\x93NUMPY", "NumPy"), (0, b"PK\3\4", "zip"), (0, b"MATLAB 5.0", "MATLAB 5")),
     *((0, b"\x0e\x03\x13\x01", "HDF4"), (0, b"SIMPLE  =", "FITS"), (4, b"jP  ", "JPEG 2000")),
-    *((0, b"\x1f\x8b\x08", "gzip"), (0, b"P5\n", "PGM"), (0, b"P5 ", "PGM")),
-    *((0, b"\x80\4\x95", "pickle"), (0, b"\x80\5\x95", "pickle")),
+    *((0, b"P5\n", "PGM"), (0, b"P5 ", "PGM"), (0, b"\x1f\x8b\x08", "gzip"), (0, b"7z\xbc", "7z")),
+    *((0, b"BZh", "bzip2"), (0, b"\xfd7zXZ", "xz"), (0, b"(\xb5/\xfd", "zstd")),
+    *((0, b"\x80\4\x95", "pickle"), (0, b"\x80\5\x95", "pickle"), (0, b"Rar!", "rar")),
 )
 PNG: Final = b"\x89PNG\r\n\x1a\n"
 _HDF5: Final = b"\x89HDF\r\n\x1a\n"  # at 0, 512, 1024, ...: what precedes is the user's
@@ -39,7 +40,7 @@ _FOREIGN: Final = {  # what to do with a format that no reader opens, by suffix 
     **dict.fromkeys(("film", "picture"), _DRAWN),
     "HDF4": "convert it by h4toh5 and use readers.array",
     **dict.fromkeys(("FITS", "pickle"), "save its array with NumPy and use readers.array"),
-    "gzip": "unpack it by gunzip",
+    **dict.fromkeys(("gzip", "bzip2", "xz", "zstd", "7z", "rar"), "unpack it"),
     **dict.fromkeys(("PGM", "JPEG 2000"), "save it as PNG of 16 bits and use readers.tiff"),
     **dict.fromkeys((".xlsx", ".xlsm", ".xls", ".ods"), "a table: export 16-bit counts as TIFF"),
     "text": "a table of temperatures, or a page of a server? Export 16-bit counts as TIFF",

@@ -41,6 +41,7 @@ _APART: Final = 1.3  # axes whose roughness differs by this factor are of anothe
 _PACKED: Final = 64  # most bytes of counts in a byte of a file; .csq at hand 11, packed TIFF 3
 SMALL: Final = 2**26  # size beyond which a recording is compared with its file [byte]
 _PIECES: Final = 2**14  # of less than 1 kB in a file
+_LISTED: Final = 16  # names of arrays in a message
 ORDERS: Final = {"<": "little", ">": "big"}  # of bytes, as numpy and people write them
 _JITTER: Final = 0.25  # of the times in names of files [frame]
 _DATE: Final = re.compile(
@@ -54,6 +55,7 @@ _SECONDS: Final = {  # names of units of time, and their seconds
     r"m(illi)?s(ec(ond)?s?)?": 1e-3,
     r"(u|\N{MICRO SIGN}|\N{GREEK SMALL LETTER MU}|micro)s(ec(ond)?s?)?": 1e-6,
     r"n(ano)?s(ec(ond)?s?)?": 1e-9,
+    r"100 ?ns|ticks?": 1e-7,  # of clocks of Windows
     r"min(ute)?s?": 60.0,
     r"h(ou)?rs?|h": 3600.0,
     r"days?|d": 86400.0,
@@ -108,12 +110,11 @@ def damage_named(label: str, rule: str) -> Iterator[None]:
     try:
         yield
     except DAMAGE as error:
-        message = " ".join(str(error).split())[:200]
         refused = isinstance(error, ValueError) and "Must " in str(error)
         if refused and label.partition("'")[2] in str(error):
             raise
-        message = str(error) if refused else f"{message}. Must be {rule}."
-        raise ValueError(f"{label}: {message}") from error
+        message = f"{' '.join(str(error).split())[:200]}. Must be {rule}."
+        raise ValueError(f"{label}: {error if refused else message}") from error
 
 
 def check_present(counts: Counts, fills: Sequence[Any], name: str) -> None:
@@ -170,6 +171,13 @@ def smoother(images: Iterable[Any], rearranged: Callable[[Any], Any] = np.ndarra
     return 0
 
 
+def check_byte_order(counts: Counts, name: str) -> None:
+    """Raise ValueError for counts, not of 8 bits, that are smoother with their bytes swapped."""
+    if smoother(counts) < 0 and not _of_8_bits(counts):
+        rule = "Must be in the byte order that is stated; FLIR's pictures are read by readers.flir"
+        raise ValueError(f"Invalid counts of '{name}': rougher than with bytes swapped. {rule}.")
+
+
 def array_name(names: Collection[str], name: str | None, path: Path, shapes: Sequence[str]) -> str:
     """Name of an array in a file, which may be left out if the file has a single array."""
     if name is None and len(names) == 1:
@@ -182,7 +190,8 @@ def array_name(names: Collection[str], name: str | None, path: Path, shapes: Seq
         label = f"'{path.name}', which has {', '.join(shapes[:3]) or 'none'}"
         raise ValueError(f"Missing array (time, y, x) in {label}. {rule}.")
     wanted = "name of one of the arrays (--variable)" if name is None else f"array '{name}'"
-    raise ValueError(f"Missing {wanted} in '{path.name}'. Must be one of {sorted(names)}.")
+    listed = sorted(names)[:_LISTED] + ["..."] * (len(names) > _LISTED)
+    raise ValueError(f"Missing {wanted} in '{path.name}'. Must be one of {listed}.")
 
 
 def check_unit(unit: str, name: str) -> None:
@@ -301,7 +310,7 @@ def _of_8_bits(counts: Counts) -> bool:
     return bool(levels[-1] < 2**8 or np.gcd.reduce(np.diff(levels), initial=0) >= 2**8)
 
 
-def clocked(counts: Counts, clock: Clock, name: str, *sentences: str, **attrs: str) -> xr.Dataset:
+def clocked(counts: Counts, clock: Any, name: str, *sentences: str, **attrs: str) -> xr.Dataset:
     """Dataset of one band of a file, from a rate [Hz] or times [s]."""
     seconds = stamps(clock, len(counts), name)
     made = recording(counts, seconds, name, {"source": name, **attrs})

@@ -44,7 +44,7 @@ def raw(
 
     Nothing in such a file tells its form. Result and errors are as from `tiff`; what is stated must
     fit the size of the file without remainder. An image is refused that is smoother, or as rough,
-    with its bytes swapped, smoother with rows and columns exchanged, or of longer numbers.
+    with its bytes swapped, smoother with rows of another length, or of longer numbers.
 
     Parameters
     ----------
@@ -87,12 +87,14 @@ def raw(
     if _are_longer(counts) or (sign == 0 and np.ptp(counts[0])):
         rule = "Must be smoother than with bytes swapped, not of 8 or 32 bits or packed"
         raise ValueError(f"Invalid counts of '{name}': no images of 16-bit numbers. {rule}.")
-    # What changes is smoother than the pattern of the pixels, and tells rows from columns.
+    # What changes is smoother than the pattern of the pixels, and tells the width of the rows.
     further = counts[:: -(-len(counts) // _FIRST)].astype(np.int32)
     images = [*counts[:_FIRST], *(further[1:] - further[0])]
-    if _recording.smoother(images, lambda frame: frame.reshape(shape[::-1])) < 0:
-        rule = "Must be rows, then columns"
-        raise ValueError(f"Invalid shape {shape} of '{name}': rougher than {shape[::-1]}. {rule}.")
+    size, widths = shape[0] * shape[1], range(shape[1] // 2 + 1, 2 * shape[1])
+    for width in (shape[0], *(width for width in widths if size % width == 0)):
+        if _recording.smoother(images, lambda frame: frame.reshape(-1, width)) < 0:  # noqa: B023
+            label = f"Invalid shape {shape} of '{name}': rougher than {(size // width, width)}"
+            raise ValueError(f"{label}. Must be rows, then columns.")
     decided = {"byte_order": byte_order, "byte_order_by": "caller"}
     return _recording.clocked(counts, clock, name, *_other_size(counts), format="raw", **decided)
 
@@ -148,14 +150,11 @@ def sequence(path: str | Path, *, clock: Clock | None = None, memory: float = ME
     _numbers.real_number("memory", memory, _numbers.POSITIVE)
     (path,) = _formats.files([path], "sequence")
     with _recording.damage_named(f"Damaged '{path.name}'", "a whole .sfmov or .hcc"):
-        read = _sfmov if path.suffix.lower() == ".sfmov" else _hcc
-        counts, times = read(path, memory)
-    if _recording.smoother(counts) < 0:
-        raise ValueError(f"Invalid counts of '{path.name}', bytes swapped. Must be little-endian.")
+        counts, times = (_sfmov if path.suffix.lower() == ".sfmov" else _hcc)(path, memory)
+    _recording.check_byte_order(counts, path.name)
     if times is not None:
         clock = _recording.check_times(times, "s", clock, path.name)
-    kind: Any = {"clock": clock, "format": path.suffix.lower()[1:]}
-    return _recording.clocked(counts, name=path.name, **kind)
+    return _recording.clocked(counts, clock, path.name, format=path.suffix.lower()[1:])
 
 
 def _frames(path: Path, form: np.dtype[Any], start: int, memory: float) -> npt.NDArray[Any]:

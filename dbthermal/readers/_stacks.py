@@ -41,13 +41,15 @@ _TEMPERATURES: Final = re.compile(  # unit of values in a description, as of Ima
     r"""(?im)\b(?:v|value[ _]?)?units?["']?\s*[:=]\s*["']?(?:[0-9./]+ ?)?"""
     r"""([cm]?K|C|(?:centi|milli)?kelvins?|(?:deg[a-z]*|\N{DEGREE SIGN})?[ _]*(?:C|celsius))\b"""
 )
+_NUMBER: Final = r"[0-9]+\.?[0-9]*(?:[eE][+-]?[0-9]+)?"
+_CALIBRATION: Final = re.compile(rf"(?m)^(c[0-9])=(-?{_NUMBER})$")  # polynomial of ImageJ
+_SCALES: Final = {"scale": (1.0,), "c1": (1.0,), "c0": (0.0, -32768.0)}  # this of signed numbers
 _IMAGEJ: Final = re.compile(r"\AImageJ=.*?^images=([0-9]{1,9})$", re.DOTALL | re.MULTILINE)
 
 # Numbers of images along axes, as ImageJ and OME write them.
 _AXES: Final = re.compile(r"""(?m)(?:^(channels|slices|frames)=|\bSize([CZT])=")([0-9]{1,9})""")
 # Intervals of frames, their unit, frame rates, and times, as ImageJ, OME and JSON write them.
 _STATED: Final = r"""(?i)\b(?:{})["']?\s*[:=]\s*["']?({})"""
-_NUMBER: Final = r"[0-9]+\.?[0-9]*(?:e[+-]?[0-9]+)?"
 _INTERVAL: Final = re.compile(_STATED.format("finterval|frame[ _]?interval|TimeIncrement", _NUMBER))
 _TIMES: Final = re.compile(_STATED.format("DeltaT", _NUMBER))
 _SIMULATED: Final = re.compile(_STATED.format("origin", "simulated"))
@@ -91,8 +93,8 @@ def tiff(
     Warns
     -----
     UserWarning
-        If dates or a description have another rate, which may be of playing it, numbers or dates of
-        files are left out, a frame is there twice, or another axis than the first may be time.
+        If dates or a description have another rate, numbers or dates leave files out, stacks before
+        the last differ in length, a frame is there twice, or another axis seems to be time.
 
     Examples
     --------
@@ -137,7 +139,11 @@ def tiff(
             counts.reshape(-1)[at : at + values.size] = values
             at += values.size
             release()
+    _recording.check_byte_order(counts, name)
     _recording.check_present(counts, sorted({v for page in pages for v in page.missing}), name)
+    if len({size, *lengths[:-1]}) > 1:
+        rule = "Must be parts of one recording, in the order of time, of which the last is shorter"
+        sentences.append(f"'{name}' have {[size, *lengths]!s:.60} frames. {rule}.")
     twins = [n for n in range(1, len(paths)) if np.array_equal(*counts[n - 1 : n + 1])]
     if twins and len(counts) == len(paths):
         label = f"'{paths[twins[0] - 1].name}' and '{paths[twins[0]].name}', {len(twins)} in all"
@@ -236,10 +242,11 @@ def _pages(path: Path) -> list[_Page]:
                 total += sum(tag.valuebytecount for tag in page.tags)
                 if total > size:  # as of a chain of pages that returns to itself
                     raise ValueError(f"{total} bytes of pixels, tags. Must fit into its {size}.")
-            description = str(file.pages[0].description)
+            # A description by its writer, and one that tifffile adds to it.
+            texts = [str(file.pages[0].description), str(file.pages[0].description1)]
+            description, stated = "\n".join(texts), max(map(_stated, texts))
             if stated_unit := _TEMPERATURES.search(description):
                 _recording.check_unit(stated_unit.group(1), path.name)
-            stated = _stated(description)
             pages[0] = pages[0]._replace(description=description)
             if not complaints.empty():  # which tifffile logs, and goes on
                 raise ValueError(complaints.get().getMessage())
@@ -329,11 +336,12 @@ def _page(page: Any, path: Path, order: str, number: int) -> _Page:
 
 
 def _no_data(page: Any, number: int) -> list[float]:
-    """Values of missing counts, by GDAL's tags of a page, which must say that it is not scaled."""
-    for role, text in _SCALING.findall(str(page.tags.valueof(_METADATA, ""))):
-        if float(text) != (neutral := float(role == "scale")):
-            label = f"GDAL {role} {text} of page {number}"
-            raise ValueError(f"Invalid {label}. Must be {neutral:g}: counts as measured.")
+    """Values of missing counts, by GDAL's tags; GDAL or ImageJ must not have scaled the page."""
+    scaling = _SCALING.findall(str(page.tags.valueof(_METADATA, "")))
+    for role, text in scaling + _CALIBRATION.findall(page.description):
+        if float(text) not in (neutral := _SCALES.get(role, (0.0,))):
+            label = f"{role} {text} of page {number}, by GDAL or ImageJ"
+            raise ValueError(f"Invalid {label}. Must be {neutral[0]:g}: counts as measured.")
     return [float(text) for text in str(page.tags.valueof(_NO_DATA, "")).strip("\0").split()]
 
 
@@ -344,18 +352,14 @@ def _stated(description: str) -> int:
     names = "".join((a or b)[0].upper() for a, b, size in stated if int(size) > 1) + "YX"
     names = names.replace("S", "Z").replace("F", "T")  # of ImageJ's slices and frames
     if shaped := description.startswith('{"shape": ['):
-        about = json.loads(description)
-        shape = about["shape"]
+        shape = (about := json.loads(description))["shape"]
         axes = shape[:-2] if all(isinstance(size, int) for size in shape) else [0]
         dims = str(about.get("axes", "YX"))
         named = zip(dims[:-2], shape, strict=False)
         names = "".join(name for name, size in named if size != 1) + dims[-2:]
-    if sum(size > 1 for size in axes) > 1:
-        rule = "Must be one, time: save each band as a file, as by ImageJ's Split Channels"
-        raise ValueError(f"Invalid axes of {axes} images. {rule}.")
-    if not _OVER_TIME.fullmatch(names):
-        rule = "Must be TYX, time, rows and columns: a band is a file"
-        raise ValueError(f"Invalid axes {names} of the images. {rule}.")
+    if sum(size > 1 for size in axes) > 1 or not _OVER_TIME.fullmatch(names):
+        rule = "Must be TYX, time, rows, columns: save bands as files, by ImageJ's Split Channels"
+        raise ValueError(f"Invalid axes {names} of {axes} images. {rule}.")
     if match := _IMAGEJ.match(description):
         return int(match.group(1))
     return math.prod(axes) if shaped else 0

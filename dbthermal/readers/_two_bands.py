@@ -133,18 +133,16 @@ def _offsets(cameras: Sequence[xr.Dataset], offset: Any) -> list[float]:
             raise ValueError(f"Unknown dates of the recordings. {rule}; 0.0 if together.")
         begun, *later = (datetime.fromisoformat(str(date)) for date in dates)
         return [(date - begun).total_seconds() for date in later]
-    offsets = [*offset] if np.ndim(offset) else [offset]
-    for value in offsets:
-        _numbers.real_number("offset [s]", value, _numbers.FINITE)
+    listed = [*offset] if np.ndim(offset) else [offset]
+    offsets = [_numbers.real_number("offset [s]", value, _numbers.FINITE) for value in listed]
     if len(offsets) != len(cameras) - 1:
-        label = f"Invalid offset {[float(value) for value in offsets]} s"
-        raise ValueError(f"{label}. Must be one for each later recording.")
+        raise ValueError(f"Invalid offset {offsets} s. Must be one for each later recording.")
     return offsets
 
 
 def _names(bands: Any, number: int) -> list[str]:
     """Names of the bands, which must be different texts, as many as stated."""
-    listed = bands if isinstance(bands, Sequence) and not isinstance(bands, str) else []
+    listed = [*bands] if isinstance(bands, list | tuple | np.ndarray) else []
     names = [str(name) for name in listed if isinstance(name, str) and name.strip()]
     if not len({*names}) == len(listed) == number:
         raise ValueError(f"Invalid bands {bands!r}. Must be {number} different names, as texts.")

@@ -141,7 +141,7 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
     made_by = result.attrs.get("provenance", {}) if provenance is None else provenance
     # What was found, by whom, and what speaks against it.
     sentences, numbers["answer"] = answer(result, table_)
-    about = [author, *(str(shot.attrs.get(name, "")) for name in ("source", "start"))]
+    about = [str(author), *(str(shot.attrs.get(name, "")) for name in ("source", "start"))]
     doubts = [*result.attrs.get("warnings", []), *hardly_measured(result)]
     if view.capture is not None and view.response is not None:
         doubts += against_response(view.capture, view.response)

@@ -297,6 +297,7 @@ test_bad_data_and_questions_are_refused = refused(
         (lambda view: view.counted("some"), "Unknown pixels 'some'"),
         (lambda _: View(separated(), still()), "Invalid size 60 of 'time' of the capture"),
         (lambda _: View(separated(), events={"lamp": np.nan}), "of the event 'lamp'"),
+        (lambda _: View(separated(), events=cast(Any, {"lamp": "on"})), "of the event 'lamp' 'on'"),
         (lambda _: View(separated(), events=cast(Any, [1.0])), "Invalid events of type list"),
     ],
     error=(TypeError, ValueError, FileNotFoundError),

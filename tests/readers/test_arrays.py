@@ -57,6 +57,9 @@ def test_times_of_npz_and_arrays_of_other_libraries(tmp_path: Path) -> None:
         np.savez(tmp_path / "a.npz", frames=scene(), **times)
         assert_allclose(read(tmp_path / "a.npz", clock=None).time, [0.0, 0.1, 0.3])
     assert_array_equal(read([*scene()]).counts, scene())
+    np.savez(tmp_path / "a.npz", *[scene()] * 20)
+    with pytest.raises(ValueError, match=r"Must be one of \['arr_0', .*, 'arr_5', '\.\.\.'\]\."):
+        read(tmp_path / "a.npz")
     torch = pytest.importorskip("torch")
     with pytest.raises(ValueError, match=r"Invalid dtype int32 of 'array'"):
         read(torch.zeros((3, 4, 5), dtype=torch.int32))
@@ -76,6 +79,12 @@ def test_a_store_of_our_own_is_no_camera(tmp_path: Path) -> None:
         read(tmp_path / "scene.zarr")
 
 
+class Quantity(np.ndarray[Any, Any]):
+    """Numbers with a unit, as of unyt and pint."""
+
+    units = "K"
+
+
 FRAMES = xr.DataArray(scene(), dims=("time", "y", "x"), name="frames")
 MILLISECONDS = xr.DataArray(100.0 * np.arange(3), dims="time", attrs={"units": "ms"})
 
@@ -91,6 +100,8 @@ MILLISECONDS = xr.DataArray(100.0 * np.arange(3), dims="time", attrs={"units": "
         (FRAMES.assign_attrs(slope=[1.0, 0.9]), {}, "Invalid 'slope' of 'array'"),
         (FRAMES.assign_attrs(Intercept=-273.15), {}, "Invalid 'intercept' of 'array', -273.15"),
         (np.ma.masked_equal(scene(), scene()[1, 2, 3]), {}, "Missing counts in 'array': masked"),
+        (scene().view(Quantity), {}, "Invalid unit 'K' of 'array'"),
+        (scene().byteswap(), {}, "Invalid counts of 'array': rougher than with bytes swapped"),
         (scene()[0], {}, r"Invalid shape \(24, 32\) of 'array'"),
         (scene()[:0], {}, r"Invalid shape \(0, 24, 32\) of .*Must be \(time, y, x\), not 0"),
         (scene().tolist(), {}, "Invalid dtype int64 of 'array'"),
@@ -133,7 +144,7 @@ def named(folder: Path, dims: tuple[str, ...]) -> dict[str, Any]:
 
 
 WRONG = ("y x t", "time x y", "band y x", "frame Column row", "t width height", "time lat lon")
-RIGHT = ("Frame ROWS cols", "image height width", "dim_0 phony_dim_1 x")
+RIGHT = ("Frame ROWS cols", "Timestamps y x", "image height width", "dim_0 phony_dim_1 x")
 
 
 @pytest.mark.parametrize("dims", [*WRONG, "channel y x", *RIGHT])
@@ -397,8 +408,8 @@ def test_times_beside_frames(tmp_path: Path, name: str) -> None:
     ):
         with pytest.raises(ValueError, match=r"Invalid times of .* Must agree to half a frame"):
             read(hdf5(path, **{name: times}))
-    days = {name.removesuffix("_s"): 45000 + np.arange(3) / 864e3}  # as in tables
-    assert_array_equal(read(hdf5(path, **days)).counts, scene())
+    for times in (45000 + np.arange(3) / 864e3, 1_000_000 * np.arange(3)):  # of tables, of Windows
+        assert_array_equal(read(hdf5(path, **{name.removesuffix("_s"): times})).counts, scene())
     assert_array_equal(read(hdf5(path, **{name: np.arange(9.0)})).counts, scene())
     with pytest.raises(ValueError, match=rf"Invalid axes of 'frames' .* '{name}' has 32\. Must be"):
         read(hdf5(path, **{name: np.arange(32.0)}))

@@ -142,6 +142,7 @@ def test_lost_frames_and_clocks(path: Path) -> None:
     with pytest.raises(ValueError, match=r"Unordered times in 'a\.seq': frame 2 is 0.500 s before"):
         readers.flir(path)
     assert_allclose(readers.flir(path, clock=50.0).time, [0, 0.02, 0.04])
+    assert_allclose(readers.flir(path, clock=50.0, frames=slice(0, 3, 2)).time, [0, 0.04])
     path.write_bytes(sequence(counts, seconds=[0.0] * 6))
     with pytest.raises(ValueError, match=r"Unknown times .* 0 of 6 frames have one. Must be given"):
         readers.flir(path)

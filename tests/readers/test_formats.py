@@ -15,6 +15,7 @@ from flir_files import scene, sequence
 from dbthermal import readers
 from dbthermal.__main__ import main
 
+PACKED = {"\x1f\x8b\x08": "gzip", "BZh": "bzip2", "\xfd7zXZ": "xz", "7z\xbc": "7z", "Rar!": "rar"}
 STATED = ["--unit", "count", "--clock", "10"]
 
 
@@ -61,7 +62,7 @@ def test_foreign_formats_are_named(tmp_path: Path) -> None:
         "RIFFxxxxWEBP": "picture: .* 8 bits",
         "\x0e\x03\x13\x01": "HDF4: convert it",
         "SIMPLE  =    T": "FITS: save its array",
-        "\x1f\x8b\x08": "gzip: unpack it",
+        **{mark: f"{name}: unpack it" for mark, name in PACKED.items()},
         "P5\n24 32": "PGM: save it as PNG",
         "\x80\x04\x95": "pickle: save its array",
     }

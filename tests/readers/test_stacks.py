@@ -22,6 +22,7 @@ FORMS: dict[str, dict[str, Any]] = {
     "axes": {"metadata": {"axes": "TYX"}},
     "ImageJ": {"imagej": True, "metadata": {"axes": "TYX"}},
     "ImageJ's slices": {"imagej": True, "metadata": {"axes": "ZYX"}},
+    "ImageJ's signed numbers": {"imagej": True, "metadata": {"axes": "TYX", "c0": -32768.0}},
     "OME": {"ome": True, "metadata": {"axes": "TYX"}},
     "strips": {"rowsperstrip": 5},
     "one page": {"truncate": True},
@@ -260,6 +261,7 @@ def test_frame_rate_of_a_description(tmp_path: Path) -> None:
 
 FOUR = scene(4).reshape(2, 2, 24, 32)
 BANDS: dict[str, Any] = {"imagej": True, "metadata": {"axes": "TCYX"}, "photometric": None}
+SCALED = {"imagej": True, "metadata": {"axes": "TYX", "c0": -273.15, "c1": 0.04}}
 SCALE, OFFSET = GDAL.format("SCALE", "scale", 0.01), GDAL.format("OFFSET", "offset", 9)
 
 
@@ -287,9 +289,14 @@ def tagged(code: int, kind: int, value: Any) -> dict[str, Any]:
         (scene() // np.uint16(256) * np.uint16(257), {}, "they have 8 bits"),
         (0 * scene(), {}, "Invalid counts of 'a.tif': all are 0. Must be 16-bit counts"),
         (scene() // np.uint16(256) * np.uint16(256) + np.uint16(9), {}, "they have 8 bits"),
-        (FOUR, {}, r"Invalid axes of \[2, 2\] images. Must be one, time"),
-        (FOUR, BANDS, r"Invalid axes of \[2, 2\] images"),
-        (FOUR, {"ome": True, "metadata": {"axes": "CTYX"}}, r"Invalid axes of \[1, 2, 2\] images"),
+        (FOUR, {}, r"Invalid axes YX of \[2, 2\] images. Must be TYX, time"),
+        (FOUR, {"description": "my lab"}, r"Invalid axes YX of \[2, 2\] images"),
+        (FOUR, BANDS, r"Invalid axes \w+ of \[2, 2\] images"),
+        (
+            FOUR,
+            {"ome": True, "metadata": {"axes": "CTYX"}},
+            r"Invalid axes \w+ of \[1, 2, 2\] images",
+        ),
         *(
             (
                 scene(),
@@ -298,16 +305,18 @@ def tagged(code: int, kind: int, value: Any) -> dict[str, Any]:
             )
             for axes in ("CYX", "XYT", "SYX", "TXY", "EYX")
         ),
-        (scene(), {"imagej": True}, "Invalid axes CYX of the images"),
-        (scene(), {"ome": True}, "Invalid axes CYX of the images"),
+        (scene(), {"imagej": True}, "Invalid axes CYX of .* images"),
+        (scene(), SCALED, "Invalid c0 -273.15 of page 0, by GDAL or ImageJ. Must be 0: counts as"),
+        (scene().byteswap(), {}, "Invalid counts of 'a.tif': rougher than with bytes swapped"),
+        (scene(), {"ome": True}, "Invalid axes CYX of .* images"),
         (scene(), {"photometric": "miniswhite"}, "Invalid photometric interpretation 0 of page 0"),
         (
             scene(),
             tagged(274, 3, 6),
             "Invalid orientation 6 of page 0. Must be 1: rows from the top",
         ),
-        (scene(), tagged(42112, 2, SCALE), "Invalid GDAL scale 0.01 of page"),
-        (scene(), tagged(42112, 2, OFFSET), "Invalid GDAL offset 9 .*Must be 0"),
+        (scene(), tagged(42112, 2, SCALE), "Invalid scale 0.01 of page 0, by GDAL"),
+        (scene(), tagged(42112, 2, OFFSET), "Invalid offset 9 .*Must be 0"),
         (
             scene(),
             tagged(42113, 2, str(scene()[1, 2, 3])),

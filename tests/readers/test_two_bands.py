@@ -79,7 +79,7 @@ def test_temperatures_in_hundredths_are_doubted(scale: int, zero: float, unit: s
     one, same, other = (readers.array(part, unit="count", clock=10.0) for part in counts)
     with pytest.warns(UserWarning, match=rf"over {scale}, are temperatures: .* {unit}\. Must be"):
         readers.two_bands(one, same, bands=BANDS, offset=0.0)
-    readers.two_bands(one, other, bands=BANDS, offset=0.0)
+    readers.two_bands(one, other, bands=np.array(BANDS), offset=xr.DataArray(0.0))  # type: ignore[arg-type]
 
 
 def test_a_capture_goes_through_corrections(pair: tuple[xr.Dataset, xr.Dataset]) -> None:
