@@ -32,9 +32,9 @@ _WIDE: Final = 6.0  # deviation of the window in which a field and its data are 
 _RIDGE: Final = 1e-6  # of the largest information, added for windows without any
 # Shift from which the cameras see reflections apart: in standard deviations, and in pixels.
 _SIGMAS, _LEAST_SHIFT = 3.0, 0.1
-# Share of what no shift leaves that a shift must explain: seen 0.36 or more; below 0.03 of clouds
-# and heat alone.
-_EXPLAINED: Final = 0.1
+# Share of what no shift leaves that a shift must explain: seen 0.4 or more; below 0.04 of clouds
+# and heat. And share of all: 0.0013 of clouds without texture, 0.005 or more of switched lamps.
+_EXPLAINED, _LEAST_GAIN = 0.1, 0.004
 _NEAR: Final = 0.125  # of the image's smaller side, by which a field is extrapolated
 
 
@@ -114,10 +114,12 @@ def _matched(corrected: xr.Dataset, capture: Capture) -> xr.Dataset:
     slower = fine if len(movies) == 1 else level(-1, 1)
     place = field.on(fine.centres())
     late, std, energy = matching.delay(slower, rate, place)
-    # A shift that explains little of what no shift leaves is not that of the reflections.
+    # A shift that explains little of what no shift leaves is not that of the reflections: shares,
+    # for at the border fewer pixels have a pair.
     still = matching.delay(slower, rate, np.zeros_like(place))[2]
-    moved, rest = np.sum([energy, still], axis=(2, 3), where=energy[1] * still[1] != 0.0)
-    if moved[0] - rest[0] <= _EXPLAINED * max(rest[1] - rest[0], 0.0):
+    sums = np.sum([energy, still], axis=(2, 3), where=energy[1] * still[1] != 0.0)
+    moved, rest = 1.0 - sums[:, 0] / sums[:, 1]
+    if not rest - max(moved, 0.0) > max(_EXPLAINED * rest, _LEAST_GAIN):
         spread = np.maximum(spread, place**2)
     result = _result(corrected, capture, field, data, spread)
     result["energy"] = ("part", "y", "x"), energy
