@@ -9,7 +9,7 @@ import xarray as xr
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from dbthermal import schema
-from dbthermal._arrays import Array, Mask, without_blas_threads
+from dbthermal._arrays import Array, Mask, quotient, without_blas_threads
 from dbthermal.alignment import _matching as matching
 from dbthermal.alignment import _planes as planes
 from dbthermal.alignment._matching import Movies
@@ -79,12 +79,8 @@ def reflection_shift(corrected: xr.Dataset, response: xr.Dataset) -> xr.Dataset:
 
 @without_blas_threads  # on any number of cores the same field
 def shift_of(corrected: xr.Dataset, scale: Scale) -> xr.Dataset:
-    """Displacement as `reflection_shift`, and its `energy`, see `matching.delay`."""
-    return _matched(corrected, Capture.of(corrected, scale))
-
-
-def _matched(corrected: xr.Dataset, capture: Capture) -> xr.Dataset:
-    """Field of a checked capture, from coarse to fine, and the delay beside it."""
+    """Displacement as `reflection_shift`, from coarse to fine, and its `energy`, see `delay`."""
+    capture = Capture.of(corrected, scale)
     shape = capture.valid.shape
     spline = Spline((shape[0], shape[1]), max(shape) / 3.0)
     factor = 2 ** max(0, int(np.log2(min(shape) / _COARSE)))
@@ -114,16 +110,15 @@ def _matched(corrected: xr.Dataset, capture: Capture) -> xr.Dataset:
     slower = fine if len(movies) == 1 else level(-1, 1)
     place = field.on(fine.centres())
     late, std, energy = matching.delay(slower, rate, place)
-    # A shift that explains little of what no shift leaves is not that of the reflections: shares,
-    # for at the border fewer pixels have a pair.
+    # A shift that explains little of what no shift leaves is not that of the reflections.
     still = matching.delay(slower, rate, np.zeros_like(place))[2]
     sums = np.sum([energy, still], axis=(2, 3), where=energy[1] * still[1] != 0.0)
-    moved, rest = 1.0 - sums[:, 0] / sums[:, 1]
+    moved, rest = 1.0 - quotient(sums[:, 0], sums[:, 1], 1.0)
     if not rest - max(moved, 0.0) > max(_EXPLAINED * rest, _LEAST_GAIN):
         spread = np.maximum(spread, place**2)
     result = _result(corrected, capture, field, data, spread)
-    result["energy"] = ("part", "y", "x"), energy
-    return result.assign_attrs(delay=late, delay_std=std)
+    delayed = result.assign_attrs(delay=late, delay_std=std)
+    return delayed.assign(energy=(("part", "y", "x"), energy))
 
 
 def seen_apart(field: xr.Dataset) -> bool:
