@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from refused import refused
+from scipy.ndimage import gaussian_filter
 from worlds import RESPONSE as WORLD
 from worlds import World, seen
 
@@ -238,6 +239,28 @@ def test_refuses_a_shift_beyond_a_third_of_the_image() -> None:
     capture, _ = drawn(46, (22.0, 0.0), Picture(shape=(40, 48)), frames=150)
     with pytest.raises(ValueError, match="less than a third of the image"):
         alignment.reflection_shift(capture, RESPONSE)
+
+
+def test_a_switched_lamp_shows_the_shift() -> None:
+    """Its picture is displaced between cameras apart, though it changes everywhere at once."""
+    rng, time = np.random.default_rng(1), np.arange(250) / 10.0
+    picture = gaussian_filter(rng.standard_normal((64, 84)), 5.0)
+    picture = 7.0 * (picture - picture.min()) / np.ptp(picture)
+    lit = np.searchsorted([2.0, 5.0, 9.0, 11.0, 16.0, 20.0], time)[:, np.newaxis, np.newaxis] % 2
+    rise = 15.0 * (1.0 - np.exp(-time / 12.0))[:, np.newaxis, np.newaxis]
+    warm = np.broadcast_to(300.0 + rise, (250, 64, 80))
+    plastic = GLASS.copy(data=[0.6, 0.7])
+    scene = simulation.scene(time, warm, warm, plastic)
+    lamps = [295.0 + lit * view for view in (picture[:, :80], picture[:, 4:])]
+    dims = ("band", *scene["object_temperature"].dims)
+    scene["background_temperature"] = dims, np.array(lamps), {"units": "K"}
+    response = simulation.Rig(noise=(0.03, 0.08)).response()
+    capture = simulation.observe(scene, response, rng)
+    field = alignment.reflection_shift(capture, response)
+    error, _ = errors(field, np.full((2, 64, 80), [[[0.0]], [[4.0]]]))
+    assert error.shape[1] > 0.9 * picture[:, :80].size
+    assert np.median(np.abs(error), axis=1).max() < 0.05
+    assert separation.separate(capture, response).attrs["reflection_shift"] == "found"
 
 
 @pytest.mark.parametrize("colour", [0.0, 1.0])
