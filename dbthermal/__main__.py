@@ -227,9 +227,9 @@ class _Parser(argparse.ArgumentParser):
 
     def parse_known_args(self, *arguments: Any, **named: Any) -> Any:
         """Options; the command refuses those that it does not know."""
-        if (found := super().parse_known_args(*arguments, **named))[1]:
-            self.error(f"unrecognized arguments: {' '.join(found[1])}")
-        return found
+        if (parsed := super().parse_known_args(*arguments, **named))[1]:
+            self.error(f"unrecognized arguments: {' '.join(parsed[1])}")
+        return parsed
 
 
 def _parser() -> argparse.ArgumentParser:

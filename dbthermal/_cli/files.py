@@ -104,7 +104,8 @@ def recording(paths: list[Path], options: Namespace, camera: int = 0) -> xr.Data
         movie = reader(paths if several else paths[0], **stated)
     if of_reader and (first := stated["frames"].start):  # times since the first frame of the files
         ends = reader(paths, **{**stated, "frames": slice(0, first + 1, first)})
-        movie["exposure_time"].values[:] += (lead := ends["exposure_time"].values[1])
+        lead = ends["exposure_time"].values[1]
+        movie["exposure_time"].values[:] += lead
         start = {"start": ends.attrs["start"]} if "start" in ends.attrs else {}
         movie = movie.assign_coords(time=movie["time"] + lead).assign_attrs(start)
     movie = _selected(movie, options, paths[0], of_reader) if "rows" in options else movie
@@ -114,16 +115,16 @@ def recording(paths: list[Path], options: Namespace, camera: int = 0) -> xr.Data
 def _selected(movie: xr.Dataset, options: Namespace, path: Path, of_reader: str = "") -> xr.Dataset:
     """Selected frames and rows; ValueError if some are not in the file or store."""
     for name, dim in (("frames", "time"), ("rows", "y")):
-        part = between(options, name)
-        movie = movie if name == of_reader else movie.isel({dim: part})
+        selected = between(options, name)
+        movie = movie if name == of_reader else movie.isel({dim: selected})
         check_all(movie.sizes[dim], options, name, f"'{path.name}'")
     return movie
 
 
 def check_all(number: int, options: Namespace, name: str, label: str) -> None:
     """Raise ValueError if fewer frames or rows than are selected are there."""
-    ends, part = vars(options)[name] or [], between(options, name)
-    if number < (wanted := len(range(part.start, part.stop or 0, part.step))):
+    ends, selected = vars(options)[name] or [], between(options, name)
+    if number < (wanted := len(range(selected.start, selected.stop or 0, selected.step))):
         rule = f"it has {number} of these {wanted}. Must have all"
         raise ValueError(f"Invalid --{name} {' '.join(map(str, ends))} of {label}: {rule}.")
 
@@ -297,9 +298,8 @@ def _unused(options: Namespace) -> dict[str, str]:
         return {"with --correction or --corrected-by-camera": "method emissivity"}
     aligned = {"without --correction, for the capture is aligned": "register offset"}
     names = "surroundings outdoors background_ratio prior workers"
-    completing = {"with --method: 'dbthermal complete'": names}
-    alone = completing if options.method else {"without --method calibrated": "emissivity"}
-    return aligned | alone
+    later = {"with --method: 'dbthermal complete'": names}
+    return aligned | (later if options.method else {"without --method calibrated": "emissivity"})
 
 
 def _of_files(options: Namespace) -> dict[str, str]:

@@ -32,8 +32,8 @@ _WIDE: Final = 6.0  # deviation of the window in which a field and its data are 
 _RIDGE: Final = 1e-6  # of the largest information, added for windows without any
 # Shift from which the cameras see reflections apart: in standard deviations, and in pixels.
 _SIGMAS, _LEAST_SHIFT = 3.0, 0.1
-# Share of what no shift leaves that a shift must explain: seen 0.4 or more; below 0.04 of clouds
-# and heat. And share of all: 0.0013 of clouds without texture, 0.005 or more of switched lamps.
+# Share of what no shift leaves that a shift must explain: seen 0.13 or more; below 0.06 of clouds
+# and heat. And share of all: 0.0013 of clouds without texture, 0.0046 to 0.027 of most lamps.
 _EXPLAINED, _LEAST_GAIN = 0.1, 0.004
 _NEAR: Final = 0.125  # of the image's smaller side, by which a field is extrapolated
 
@@ -113,8 +113,8 @@ def shift_of(corrected: xr.Dataset, scale: Scale) -> xr.Dataset:
     # A shift that explains little of what no shift leaves is not that of the reflections.
     still = matching.delay(slower, rate, np.zeros_like(place))[2]
     sums = np.sum([energy, still], axis=(2, 3), where=energy[1] * still[1] != 0.0)
-    moved, rest = 1.0 - quotient(sums[:, 0], sums[:, 1], 1.0)
-    if not rest - max(moved, 0.0) > max(_EXPLAINED * rest, _LEAST_GAIN):
+    moved, unmoved = 1.0 - quotient(sums[:, 0], sums[:, 1], 1.0)
+    if not unmoved - max(moved, 0.0) > max(_EXPLAINED * unmoved, _LEAST_GAIN):
         spread = np.maximum(spread, place**2)
     result = _result(corrected, capture, field, data, spread)
     delayed = result.assign_attrs(delay=late, delay_std=std)

@@ -173,7 +173,7 @@ def encode(frame: Packet) -> bytes:
 
 
 def next_sequence(sequence: int) -> int:
-    """Next larger sequence number without a byte that would be escaped; 0 after the largest."""
+    """Larger sequence number without a byte that would be escaped; 0 after the largest."""
     following = ((sequence + 1) % (1 << 32)).to_bytes(4, "big")
     return int.from_bytes(following.translate(_RAISED), "big")
 

@@ -95,8 +95,8 @@ def array(
     _recording.check_unit(unit, label)
     _numbers.real_number("memory", memory, _numbers.POSITIVE)
     (path,) = _formats.files([source], "array") if isinstance(source, str | Path) else (Path(),)
-    inside = path.rglob("*") if path.is_dir() else [path]
-    stored = sum(file.lstat().st_size for file in inside) if is_file else np.inf
+    files = path.rglob("*") if path.is_dir() else [path]
+    stored = sum(file.lstat().st_size for file in files) if is_file else np.inf
     with ExitStack() as stack:
         # The array and its times, which are checked before it is read.
         values: Any = source
@@ -220,17 +220,17 @@ def _times_of(arrays: dict[str, Any], name: str, path: Path) -> dict[str, Any]:
     if dims and (group, dims[0]) in lines:
         return {dims[0]: lines[group, dims[0]]}
     films = sum(array.ndim == 3 for array in arrays.values())
-    beside = {
+    named = {
         key: array
         for (place, key), array in lines.items()
         if _BESIDE.fullmatch(key) and (place == group or films == 1)
     }
-    for key, number in ((key, times.size) for key, times in beside.items()):
+    for key, number in ((key, times.size) for key, times in named.items()):
         if number != frames and number in image:
             label = f"'{name}' of '{path.name}', {frames} frames of {image}: '{key}' has {number}"
             rule = "Must be (time, y, x), in MATLAB (y, x, time): transpose it, or rename the times"
             raise ValueError(f"Invalid axes of {label}. {rule}.")
-    return {key: times for key, times in beside.items() if times.size == frames}
+    return {key: times for key, times in named.items() if times.size == frames}
 
 
 def _opened(path: Path, name: str | None, stack: ExitStack) -> tuple[Any, dict[str, Any]]:

@@ -76,8 +76,8 @@ def two_bands(
     names = _names(bands, len(cameras))
     for name, recording in zip(names, cameras, strict=True):
         _check(recording, name)
-    shape, *others = [(recording.sizes["y"], recording.sizes["x"]) for recording in cameras]
-    if unlike := {*others} - {shape}:
+    shape, *shapes = [(recording.sizes["y"], recording.sizes["x"]) for recording in cameras]
+    if unlike := {*shapes} - {shape}:
         label = f"Different sizes {shape} and {unlike.pop()} pixels of the bands {names}"
         raise ValueError(f"{label}. Must be equal: resample recordings, or crop the others.")
     # Offsets of the clocks, by which they must overlap.
@@ -86,7 +86,7 @@ def two_bands(
     overlap = min(np.add(stops, shifts)) - max(np.add(starts, shifts))
     lengths = [recording.sizes["time"] for recording in cameras]
     if not overlap > 0 and max(lengths) > 1:
-        later, spans = (" and ".join(f"{it:g}" for it in each) for each in (shifts[1:], stops))
+        later, spans = (" and ".join(f"{it:g}" for it in times) for times in (shifts[1:], stops))
         label = f"Invalid offset {later} s: the recordings of {spans} s do not overlap"
         raise ValueError(f"{label}. Must overlap; give offset= if a camera's clock is wrong.")
     # No two recordings may have the same counts, as of a file that is named twice.

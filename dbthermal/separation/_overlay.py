@@ -161,9 +161,9 @@ class Laid(Moved):
         if field is None:
             return None
         schema.check(field, "reflection_shift")
-        others = self.motion[self.capture["band"].values != self.reference, 0]
+        motion = self.motion[self.capture["band"].values != self.reference, 0]
         places = places_of(field["known"].shape)
-        displacement = sources_of(-others.mean(axis=0), places) - np.indices(places.shape[1:])
+        displacement = sources_of(-motion.mean(axis=0), places) - np.indices(places.shape[1:])
         return field.assign(shift=field["shift"] - displacement.astype(np.float32))
 
 

@@ -37,7 +37,7 @@ class Equations:
 
     first: Floats  # e_1 (pixel) [1]
     shares: Floats  # c of eq. 6 (band, pixel) [1]
-    there: csr_array  # weights of x(p) (pixel, pixel), of the linked pixels
+    pairing: csr_array  # weights of x(p) (pixel, pixel), of the linked pixels
     onward: csr_array  # weights of the equation at p + d(p) (backward pixel, pixel)
     ways: tuple[Whole, ...]  # pixels solved for x(r), for x(p), and without such neighbours
     bends: Floats  # coefficients of u_m(x) - u_1(x) of u_1(x) (band - 1, degree + 1), rising
@@ -55,7 +55,7 @@ class Equations:
             self,
             first=self.first[places],
             shares=np.ascontiguousarray(self.shares[:, places]),
-            there=self.there[places][:, places],
+            pairing=self.pairing[places][:, places],
             onward=self.onward[:, places],
             ways=tuple(np.searchsorted(places, pixels) for pixels in self.ways),
         )
@@ -71,12 +71,12 @@ class Equations:
         way, place = np.zeros((2, self.first.size), dtype=np.intp)
         for number, pixels in enumerate(self.ways):
             way[pixels], place[pixels] = number, np.arange(pixels.size)
-        matrices = self.there, self.onward
-        there, onward = ((matrix.indptr, matrix.indices, matrix.data) for matrix in matrices)
+        matrices = self.pairing, self.onward
+        pairs, onward = ((matrix.indptr, matrix.indices, matrix.data) for matrix in matrices)
         beyond = np.ascontiguousarray((self.onward @ self.shares[1:].T).T)
         # The known change (loose, frame) [K] is e_1 [u_1(x(p)) - u_1(x(r))].
         moved = np.asarray(change / self.first[self.ways[relaxation.LOOSE], np.newaxis], np.float32)
-        terms = relaxation.Terms(self.shares, self.bends, way, place, there, onward, beyond, moved)
+        terms = relaxation.Terms(self.shares, self.bends, way, place, pairs, onward, beyond, moved)
         target, signal = (np.array(film, np.float32, order="C") for film in (target, start))
         at_p, step = np.empty_like(signal), np.zeros(len(signal), np.float32)
         relaxation.relax(terms, target, signal, step)
@@ -149,7 +149,7 @@ def equations(inputs: Inputs, emissivity: Floats, solved: Mask) -> Equations:
     return Equations(
         first=np.where(solved, emissivity[0], 1.0),
         shares=shares,
-        there=csr_array(diags_array(linked.astype(np.float32)) @ at_p.astype(np.float32)),
+        pairing=csr_array(diags_array(linked.astype(np.float32)) @ at_p.astype(np.float32)),
         onward=csr_array(onward[backward].astype(np.float32)),
         ways=(np.flatnonzero(linked & strong), backward, np.flatnonzero(solved & ~linked)),
         bends=bends(tuple(inputs.curves[band] for band in inputs.bands)),

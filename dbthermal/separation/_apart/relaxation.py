@@ -29,7 +29,7 @@ class Terms(NamedTuple):
     bends: Floats  # (band - 1, degree + 1)
     way: Whole  # `FORWARD`, `BACKWARD` or `LOOSE` (pixel)
     place: Whole  # among the pixels of that way (pixel)
-    there: Rows  # (pixel, pixel)
+    pairing: Rows  # (pixel, pixel)
     onward: Rows  # (backward pixel, pixel)
     beyond: Floats  # c_m at p + d(p) (band - 1, backward pixel) [1]
     change: Floats  # u_1(x(p)) - u_1(x(r)) (loose pixel, frame) [K]
@@ -64,12 +64,12 @@ def _at_p(terms: Terms, pixel: int, signal: Floats, film: Floats) -> None:
         for t in range(film.size):
             film[t] = signal[pixel, t] + change[t]
         return
-    starts, columns, values = terms.there
+    starts, columns, values = terms.pairing
     film[:] = 0.0
     for entry in range(starts[pixel], starts[pixel + 1]):
-        weight, beside = values[entry], signal[columns[entry]]
+        weight, neighbour = values[entry], signal[columns[entry]]
         for t in range(film.size):
-            film[t] += weight * beside[t]
+            film[t] += weight * neighbour[t]
 
 
 @inlined
@@ -81,9 +81,9 @@ def _forward(
     _at_p(terms, pixel, signal, film)
     _other_bands(terms.shares[1:], pixel, terms.bends, film, spare)
     for t in range(film.size):
-        left = target[pixel, t] - spare[t]
+        remainder = target[pixel, t] - spare[t]
         # Of a loose pixel a step of Newton, of a slope near sum c = 1.
-        film[t] = signal[pixel, t] * (1.0 - first) + left if loose else left / first
+        film[t] = signal[pixel, t] * (1.0 - first) + remainder if loose else remainder / first
 
 
 @inlined
@@ -139,8 +139,8 @@ def second_place(terms: Terms, target: Floats, signal: Floats, result: Floats) -
             slope = second[:, pixel].sum()
             _other_bands(second, pixel, terms.bends, film, spare)
             for t in range(film.size):
-                left = target[pixel, t] - terms.shares[0, pixel] * signal[pixel, t] - spare[t]
-                film[t] += left / slope
+                remainder = target[pixel, t] - terms.shares[0, pixel] * signal[pixel, t] - spare[t]
+                film[t] += remainder / slope
         result[pixel] = film
 
 
@@ -154,4 +154,4 @@ def changes(signals: Floats, pixels: Whole, shares: Floats, bend: Floats, result
             for degree in range(bend.size - 1, -1, -1):
                 of_r, of_p = of_r * at_r + bend[degree], of_p * at_p + bend[degree]
             change = shares[p] * (change + of_p - of_r)
-            result[t, p] = change if abs(change) < _ENDLESS else 0.0  # nor NaN
+            result[t, p] = change if abs(change) < _ENDLESS else 0.0  # so is NaN
