@@ -16,7 +16,7 @@ from dbthermal import _rows, _text, schema, store
 from dbthermal import response as responses
 from dbthermal._arrays import made_on_disk, on_disk
 from dbthermal.alignment import _joint, align, register
-from dbthermal.alignment._planes import Scale, share_displaced
+from dbthermal.alignment._planes import Scale, displaced_windows
 from dbthermal.alignment._resampling import on_one_clock, registered
 from dbthermal.correction import correct_capture
 from dbthermal.separation import separate
@@ -166,13 +166,13 @@ def _aligned(
     if "offset" in options:
         aligned = on_one_clock(corrected, **options)
         field = _joint.apart(corrected, scale, **options)
-        if field is not None and share_displaced(aligned, scale) > 0.0:
+        if field is not None and displaced_windows(aligned, scale)[0]:
             return aligned, field
         return aligned, None
     # Clocks and shift from the images.
     comparison = _joint.compare(corrected, scale, **options)
     aligned = on_one_clock(corrected, **{**options, "offset": comparison.offset})
-    if comparison.field is not None and not share_displaced(aligned, scale) > 0.0:
+    if comparison.field is not None and not displaced_windows(aligned, scale)[0]:
         # Displaced cameras without a shift: their clocks at one place.
         comparison = _joint.compare(corrected, scale, **options, side_by_side=False)
         aligned = on_one_clock(corrected, **{**options, "offset": comparison.offset})

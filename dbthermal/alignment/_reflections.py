@@ -33,8 +33,8 @@ _RIDGE: Final = 1e-6  # of the largest information, added for windows without an
 # Shift from which the cameras see reflections apart: in standard deviations, and in pixels.
 _SIGMAS, _LEAST_SHIFT = 3.0, 0.1
 # Share of what no shift leaves that a shift must explain: seen 0.13 or more; below 0.06 of clouds
-# and heat. And share of all: 0.0013 of clouds without texture, 0.0046 to 0.027 of most lamps.
-_EXPLAINED, _LEAST_GAIN = 0.1, 0.004
+# and heat. And share of all: 0.0013 of clouds without texture, 0.0035 to 0.027 of lamps.
+_EXPLAINED, _LEAST_GAIN = 0.1, 0.0025
 _NEAR: Final = 0.125  # of the image's smaller side, by which a field is extrapolated
 
 

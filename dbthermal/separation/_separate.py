@@ -14,7 +14,7 @@ import xarray as xr
 from dbthermal import _numbers, _samples, alignment, schema
 from dbthermal._arrays import without_blas_threads
 from dbthermal._warnings import warned
-from dbthermal.alignment._planes import Scale, share_displaced
+from dbthermal.alignment._planes import Scale, displaced_windows
 from dbthermal.alignment._reflections import seen_apart
 from dbthermal.bands import FILTERS
 from dbthermal.emissivity import colour_of
@@ -343,8 +343,8 @@ def _over_found_materials(
 def _shift(corrected: xr.Dataset, response: xr.Dataset) -> tuple[xr.Dataset | None, float]:
     """Shift of the reflections where cameras stand apart, else how many windows are so for none."""
     names = [str(name) for name in corrected["band"].values]
-    share = share_displaced(corrected, Scale.of_response(response, names))
-    if share > 0.0:
+    suspected, share = displaced_windows(corrected, Scale.of_response(response, names))
+    if suspected:
         with suppress(ValueError):  # no shift explains it: the pixels keep the flag
             shift = alignment.reflection_shift(corrected, response)
             if seen_apart(shift):
