@@ -33,9 +33,6 @@ _CORRELATION_STD = np.sqrt(35.0 / 18.0)
 
 def second_difference(signal: Array, time: npt.ArrayLike) -> Array:
     """Second difference in time of signals (time, pixel); white noise keeps its variance."""
-    signal = _numbers.real_numbers("signal", signal)
-    if np.any(np.isinf(signal)):
-        raise ValueError("Invalid signal: infinite. Must be finite, or NaN.")
     time = _numbers.real_numbers("time [s]", time, shape=signal.shape[:1])
     if np.any(bad := ~(np.diff(time) > 0.0)):
         place = int(np.argmax(bad))

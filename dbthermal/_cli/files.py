@@ -16,10 +16,10 @@ import xarray as xr
 from dbthermal import _rows, readers, schema, store
 from dbthermal._arrays import on_disk
 from dbthermal._cli import PLUS, accepted, is_source, leaves
-from dbthermal._warnings import warned
 from dbthermal.explorer._answer import answer
 from dbthermal.readers import _formats as formats
 from dbthermal.response import ACCURACY
+from dbthermal.schema import warned
 from dbthermal.store import _integrity as integrity
 
 _MADE_BY = {

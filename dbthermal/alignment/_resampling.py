@@ -10,10 +10,10 @@ from scipy.sparse import csr_array, diags_array, eye_array
 
 from dbthermal import _numbers, _rows, schema
 from dbthermal._arrays import Array, Mask
-from dbthermal._coordinates import laid_on
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment import _offset as lags
 from dbthermal.alignment._splines import Movie
+from dbthermal.schema import laid_on
 
 TRANSFORM: Final = schema.Variable(
     ("band", "row", "column"), "float64", "1", "pixel of the first view to pixel of this one"

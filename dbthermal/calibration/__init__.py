@@ -128,33 +128,22 @@ NO_BIAS: Final = Bias()
 """Readings whose errors are independent."""
 
 
-class _Signal(NamedTuple):
-    """Blackbody signal (n) [count]; its independent errors (n), and common ones (term, n)."""
-
-    values: Array
-    std: Array
-    bias: Array
-
-    @property
-    def covariance(self) -> Array:
-        """Covariance (n, n) of the signal [count^2]."""
-        return np.asarray(np.diag(self.std**2) + self.bias.T @ self.bias)
-
-
 class _Signals(NamedTuple):
-    """Counts I (n) of a band and their noise [count], and the signals W_o and W_b."""
+    """Counts I (n) of a band, their noise, W_o and W_b (n) [count], and covariances (n, n)."""
 
     counts: Array
     noise: float
-    emitted: _Signal
-    reflected: _Signal
+    emitted: Array
+    emitted_covariance: Array
+    reflected: Array
+    reflected_covariance: Array
 
     def weighted(self, emissivity: float, values: Array) -> Array:
         """Inverse covariance of the residual y - e x, times values (n)."""
         # s_I^2 + e^2 cov(W_o) + (1 - e)^2 cov(W_b)
         covariance = self.noise**2 * np.eye(values.size)
-        covariance += emissivity**2 * self.emitted.covariance
-        covariance += (1.0 - emissivity) ** 2 * self.reflected.covariance
+        covariance += emissivity**2 * self.emitted_covariance
+        covariance += (1.0 - emissivity) ** 2 * self.reflected_covariance
         return np.asarray(np.linalg.solve(covariance, values))
 
 
@@ -188,14 +177,10 @@ def fit_emissivity(
     Dataset
         `emissivity`, `emissivity_std` (band) [1]; `reduced_chi2` (band) [1], near 1 if the
         uncertainties are realistic; `residual` (band, measurement) [count].
-
-    Raises
-    ------
-    TypeError, ValueError, ArithmeticError
-        If an input is not as described or not finite, there are fewer than two measurements, a
-        temperature lies outside the response, object and background differ by less than three
-        standard deviations, or a result lies outside `schema.EMISSIVITY_LIMITS` by more than three;
-        if the fit does not converge.
+        TypeError, ValueError or ArithmeticError if an input is not as described or not finite,
+        there are fewer than two measurements, a temperature lies outside the response, object and
+        background differ by less than three standard deviations, a result lies outside
+        `schema.EMISSIVITY_LIMITS` by more than three, or the fit does not converge.
 
     References
     ----------
@@ -227,10 +212,11 @@ def fit_emissivity(
     signals = {}
     for curve, noise, counts in _bands(measured, response, warm):
         require_range(cold, curve, "background temperature")
-        emitted = _Signal(curve.counts(warm), *bias.emitted(curve, warm, float(stds[0])))
-        errors = bias.reflected(curve, cold, float(stds[1]))
-        reflected = _Signal(bias.reflection(curve, cold), *errors)
-        signals[curve.band] = _Signals(counts, noise, emitted, reflected)
+        reflected = _covariance(*bias.reflected(curve, cold, float(stds[1])))
+        emitted = curve.counts(warm), _covariance(*bias.emitted(curve, warm, float(stds[0])))
+        signals[curve.band] = _Signals(
+            counts, noise, *emitted, bias.reflection(curve, cold), reflected
+        )
     return _fit(signals)
 
 
@@ -291,10 +277,9 @@ def reflector_emissivity(
     for (curve, noise, counts), foil in zip(_bands(measured, response, warm), foils, strict=True):
         cold = curve.inverse(foil)
         _require_contrast(warm - cold, stds, f"reflection in band '{curve.band}'")
-        emitted = _Signal(curve.counts(warm), *bias.emitted(curve, warm, float(stds[0])))
-        std = np.hypot(noise, curve.count_slope(cold) * stds[1])
-        reflected = _Signal(foil, std, np.zeros((0, warm.size)))
-        signals[curve.band] = _Signals(counts, noise, emitted, reflected)
+        emitted = curve.counts(warm), _covariance(*bias.emitted(curve, warm, float(stds[0])))
+        reflected = foil, np.diag(np.hypot(noise, curve.count_slope(cold) * stds[1]) ** 2)
+        signals[curve.band] = _Signals(counts, noise, *emitted, *reflected)
     return _fit(signals)
 
 
@@ -320,6 +305,11 @@ def _bands(
     return list(zip(curves, noises, measured["counts"].values.astype(np.float64), strict=True))
 
 
+def _covariance(std: Array, bias: Array) -> Array:
+    """Covariance (n, n) of a signal, by independent errors (n) and common ones (term, n)."""
+    return np.asarray(np.diag(std**2) + bias.T @ bias)
+
+
 def _require_contrast(difference: Array, stds: Array, partner: str) -> None:
     """Refuse temperatures that differ by less than the readings resolve."""
     contrast, least = np.abs(difference).max(), 3.0 * float(np.hypot(*stds))
@@ -343,15 +333,15 @@ def _fit(signals: dict[str, _Signals]) -> xr.Dataset:
 def _fit_band(signals: _Signals, name: str) -> tuple[float, float, float, Array]:
     """Emissivity, its standard deviation, reduced chi-square and residuals of one band."""
     # Line through the origin, of I - W_b over W_o - W_b [count].
-    x = signals.emitted.values - signals.reflected.values
-    y = signals.counts - signals.reflected.values
+    x = signals.emitted - signals.reflected
+    y = signals.counts - signals.reflected
     emissivity = float(x @ y / (x @ x))
     for _ in range(_ITERATIONS):
         # York et al. (2004): weigh by the abscissa as the fit adjusts it, without its scatter,
         # x - cov(x, r) cov(r)^-1 r with cov(x, r) = -e cov(W_o) + (1 - e) cov(W_b).
         weighted = signals.weighted(emissivity, y - emissivity * x)
-        adjusted = x + emissivity * signals.emitted.covariance @ weighted
-        adjusted = adjusted - (1.0 - emissivity) * signals.reflected.covariance @ weighted
+        adjusted = x + emissivity * signals.emitted_covariance @ weighted
+        adjusted = adjusted - (1.0 - emissivity) * signals.reflected_covariance @ weighted
         weights = signals.weighted(emissivity, adjusted)
         previous, emissivity = emissivity, float((weights @ y) / (weights @ x))
         if abs(emissivity - previous) < _CONVERGED:

@@ -13,7 +13,6 @@ from scipy.special import chdtri
 from dbthermal import _numbers, bands, planck, schema
 from dbthermal import response as responses
 from dbthermal._arrays import Array
-from dbthermal._warnings import warned
 from dbthermal.response import ACCURACY, Curve
 
 AMBIENT: Final = 298.15
@@ -99,19 +98,11 @@ def fit_response(  # noqa: PLR0913 - what is known of blackbody and cameras, by 
         `netd` (band) [K]. `offset_std`, `gain_std`, `pattern_std` (band), `blackbody_accuracy`,
         `blackbody_emissivity`, `room_temperature` and `background_ratio_std` as stated. Attribute
         ``blackbody``, the temperatures and their deviations in words, which results repeat.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an input is not as described, a value is NaN, or the counts follow no Planck curve, as of
-        a camera that saturates, changes its range, or gives counts linear in temperature; the error
-        names the temperature.
-
-    Warns
-    -----
-    UserWarning
-        If the NETD of a band of `bands.FILTERS` is less than half that of one that contains it:
-        then their names or files may be exchanged.
+        TypeError or ValueError if an input is not as described, a value is NaN, or the counts
+        follow no Planck curve, as of a camera that saturates, changes its range, or gives counts
+        linear in temperature; the error names the temperature. UserWarning if the NETD of a band of
+        `bands.FILTERS` is less than half that of one that contains it: then their names or files
+        may be exchanged.
 
     References
     ----------
@@ -189,7 +180,7 @@ def fit_response(  # noqa: PLR0913 - what is known of blackbody and cameras, by 
     # Noise in kelvin at the reference temperature.
     netd = noises / np.array([curve.reference_slope for curve in curves])
     result = result.assign(schema.variables("response", {"noise": noises, "netd": netd}))
-    return warned(result, *_exchanged(dict(zip(names, netd, strict=True))))
+    return schema.warned(result, *_exchanged(dict(zip(names, netd, strict=True))))
 
 
 def _exchanged(netd: Mapping[str, float]) -> list[str]:
@@ -211,8 +202,9 @@ def maker_response(files: Mapping[str, Mapping[str, Any]]) -> xr.Dataset:
 
     .. math:: I(T) = \frac{R_1}{R_2 (\exp(B / T) - F)} - O
 
-    is, for F = 1, the Sakuma-Hattori curve with :math:`C = R_1 / R_2`, :math:`A = c_2 / B` and no
-    shift; for another F the curve is fitted over the camera's range, with an error that is stated.
+    (Tattersall 2017, Thermimage, doi:10.5281/zenodo.1069704) is, for F = 1, the Sakuma-Hattori
+    curve with :math:`C = R_1 / R_2`, :math:`A = c_2 / B` and no shift; for another F the curve is
+    fitted over the camera's range, with an error that is stated.
 
     These constants have no error bars, and what a filter in front of the lens takes away is not in
     them; results say so in ``calibration``. The maker states 2 K or 2 % as a rule: the bars of a
@@ -231,16 +223,8 @@ def maker_response(files: Mapping[str, Mapping[str, Any]]) -> xr.Dataset:
         Stage `response` of `schema`, without `noise`, over the range of temperatures that the
         cameras share. Attributes ``calibration`` ("maker's constants, without error bars") and
         ``form_error`` [K], the largest error of the form.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the files, or those of a band, are no mapping; a constant is missing or not positive, the
-        ranges do not overlap, or the form does not fit.
-
-    References
-    ----------
-    .. [1] Tattersall (2017), Thermimage, doi:10.5281/zenodo.1069704, for the maker's formula
+        TypeError or ValueError if the files, or those of a band, are no mapping; a constant is
+        missing or not positive, the ranges do not overlap, or the form does not fit.
 
     Examples
     --------
@@ -253,11 +237,9 @@ def maker_response(files: Mapping[str, Mapping[str, Any]]) -> xr.Dataset:
     """
     if not files:
         raise ValueError("Empty mapping of files. Must have the attributes of one band at least.")
-    listing: Any = files
-    for entry in (listing, *(listing.values() if isinstance(listing, Mapping) else ())):
-        if not isinstance(entry, Mapping):
-            rule = "Must be a mapping: attributes by band"
-            raise TypeError(f"Invalid files of type {type(entry).__name__}. {rule}.")
+    schema.require(files, Mapping, "files by band")
+    for attrs in files.values():
+        schema.require(attrs, Mapping, "files of a band")
     ranges = [
         [_constant(attrs, f"range_{end}", band) for end in ("min", "max")]
         for band, attrs in files.items()

@@ -14,7 +14,6 @@ import xarray as xr
 
 from dbthermal import _numbers, _rows, schema
 from dbthermal._arrays import Mask
-from dbthermal._warnings import warned
 from dbthermal.correction._frames import sampling, unreported
 from dbthermal.correction._nonuniformity import (
     DETECTOR_MAXIMUM,
@@ -140,13 +139,8 @@ def correct_capture(  # noqa: PLR0913 - the options of each step, by name
         (band) [count]. Attributes: those of the steps; ``shutter_events`` (renewals of the
         offsets), ``frames_taken_out`` (by band, by `mark_shutter`), ``bad_frames`` (by band, which
         show no scene), and ``shutter_closed_frames`` (by band, recorded as closed; -1 without
-        `frame_flags`).
-
-    Warns
-    -----
-    UserWarning
-        Of bad frames, which it names, of frames that a stream repeats, and of a pattern that
-        changes or is not corrected.
+        `frame_flags`). UserWarning of bad frames, which it names, of frames that a stream repeats,
+        and of a pattern that changes or is not corrected.
 
     Examples
     --------
@@ -199,7 +193,7 @@ def correct_capture(  # noqa: PLR0913 - the options of each step, by name
     if "exposure_time" not in capture:
         result = result.drop_vars("exposure_time", errors="ignore")
     number = -1 if closed is None else closed.sum("time").values.tolist()
-    return warned(result.assign_attrs(shutter_closed_frames=number), *notes)
+    return schema.warned(result.assign_attrs(shutter_closed_frames=number), *notes)
 
 
 def _by_rows(measured: Callable[..., xr.Dataset], raw: xr.DataArray) -> xr.Dataset:

@@ -12,7 +12,6 @@ from scipy.ndimage import maximum_filter1d, median_filter
 
 from dbthermal import _numbers, _rows, _samples, schema
 from dbthermal._arrays import Array, Mask, quotient
-from dbthermal._warnings import warned
 from dbthermal.correction._nonuniformity import OUTLIER, outlying
 from dbthermal.noise import MAD, MINIMUM_FRAMES
 from dbthermal.schema import Status
@@ -52,11 +51,12 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     as a wire, cannot be told from a pixel that blinks, and is marked, too.
 
     Pattern. What the mean picture has beside planes and edges is the fixed pattern p of gains and
-    offsets (by the mask of [1]_); 0 where it is less than 0.7 of the same over two pixels, as of
-    detail behind a lens. More than 5 m in every segment give a UserWarning. A pattern that came
-    since the calibration is seen so, beyond `pattern_std` and the noise of the mean, in the segment
-    with the least. It is added to `pattern_std`, with a smooth part of 0.75 times its size, as of a
-    lens or housing that warmed: no image tells that from the scene, it is a prior.
+    offsets, by the mask of Immerkaer (1996, doi:10.1006/cviu.1996.0060); 0 where it is less than
+    0.7 of the same over two pixels, as of detail behind a lens. More than 5 m in every segment give
+    a UserWarning. A pattern that came since the calibration is seen so, beyond `pattern_std` and
+    the noise of the mean, in the segment with the least. It is added to `pattern_std`, with a
+    smooth part of 0.75 times its size, as of a lens or housing that warmed: no image tells that
+    from the scene, it is a prior.
 
     TypeError or ValueError if the threshold is not positive, or a band has fewer frames that are
     not NaN than 16, or than 0.4 s and three frames more, or no pixel with 16 samples.
@@ -76,11 +76,6 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
         `pattern_std` (band) [count]; and the attributes ``noisy_pixels`` and ``jumping_pixels``,
         their numbers, ``unjudged_pixels``, those with fewer than 16 samples that are not NaN in a
         band, which get no bit here, ``bad_threshold``, and ``fixed_pattern`` (band), p / m [1].
-
-    References
-    ----------
-    .. [1] Immerkaer (1996), Computer Vision and Image Understanding 64, 300,
-       doi:10.1006/cviu.1996.0060
 
     Examples
     --------
@@ -148,7 +143,7 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     marked = {"noisy_pixels": noisy, "jumping_pixels": jumping, "unjudged_pixels": unjudged}
     numbers = {name: int(mask.sum()) for name, mask in marked.items()}
     fixed = [round(pattern, 3) for pattern in patterns]
-    result = warned(result, *([_UNCORRECTED.format(", ".join(strong))] if strong else []))
+    result = schema.warned(result, *([_UNCORRECTED.format(", ".join(strong))] if strong else []))
     return result.assign_attrs(numbers, bad_threshold=threshold, fixed_pattern=fixed)
 
 

@@ -13,8 +13,6 @@ import xarray as xr
 
 from dbthermal import _rows, schema
 from dbthermal._arrays import Mask, stride
-from dbthermal._coordinates import laid_on
-from dbthermal._warnings import warned
 
 Integers = npt.NDArray[np.int64]
 
@@ -76,7 +74,7 @@ def events_of(
     """Events, as of `find_shutter`, of frames (band, time) that repeat, are `closed` or `steps`."""
     shut = np.zeros((counts.sizes["band"], counts.sizes["time"]), dtype=bool)
     if closed is not None:
-        closed = laid_on(closed, counts, "the closed frames", "the capture")
+        closed = schema.laid_on(closed, counts, "the closed frames", "the capture")
         if closed.dtype != bool:
             raise TypeError(f"Invalid dtype {closed.dtype} of the closed frames. Must be bool.")
         if closed.dims not in {("time",), ("band", "time")}:
@@ -185,7 +183,7 @@ def distinct(capture: xr.Dataset) -> tuple[xr.Dataset, Mask]:
     pairs = zip(counts["band"].values, shown, strict=True)
     label = ", ".join(f"{number} times in band '{band}'" for band, number in pairs if number > 1)
     said = f"Each frame is repeated, {label}: a stream faster than its sensor. One of each is kept"
-    return warned(result, said), duplicate
+    return schema.warned(result, said), duplicate
 
 
 def copies(counts: xr.DataArray) -> Mask:
@@ -233,7 +231,7 @@ def _positions(events: xr.Dataset, counts: xr.DataArray) -> tuple[Integers, Inte
         raise ValueError(f"{message}. Must lie in [0, {counts.sizes['time'] - 1}], not fall.")
     if "start" in events:
         starts = events["start"].rename(event="time").assign_coords(time=events["start"].values)
-        laid_on(starts, counts.isel(time=first), "the events", "the capture")
+        schema.laid_on(starts, counts.isel(time=first), "the events", "the capture")
     return first, after, bands
 
 

@@ -8,8 +8,6 @@ import xarray as xr
 from dbthermal import _numbers, _rows, _smooth, schema
 from dbthermal import response as responses
 from dbthermal._arrays import Array, Mask
-from dbthermal._coordinates import laid_on
-from dbthermal._warnings import warned
 
 _LONGEST = 1.0  # time constant of a pixel [s]; of microbolometers it is some 10 ms
 _PATCH = schema.Variable(("y", "x"), "bool", "1", "patch of constant temperature")
@@ -155,7 +153,7 @@ def time_constants(time_constant: float | xr.DataArray, counts: xr.DataArray) ->
 
 def _good(patches: xr.DataArray, corrected: xr.Dataset, label: str) -> Mask:
     """Pixels (..., y, x) of patches, less those with a status."""
-    marked = laid_on(patches, corrected, label, "the capture").values
+    marked = schema.laid_on(patches, corrected, label, "the capture").values
     return np.asarray(marked & (schema.pixel_status(corrected) == 0))
 
 
@@ -227,6 +225,6 @@ def refer(corrected: xr.Dataset, reference: Reference, *, lazy: bool) -> xr.Data
             label = f"Patch {patch} of {temperatures[patch]:.6g} K reads about {off[patch]:+.2g} K"
             label += f" off in band '{names[band]}', {times[patch]:.0f} deviations of its response"
             notes.append(f"{label}. Must be black, and right: all levels follow it.")
-    result = _rows.changed(counts, lambda values: lines[0] * values + lines[1], lazy=lazy)
+    film = _rows.changed(counts, lambda values: lines[0] * values + lines[1], lazy=lazy)
     level = {"temperature": float(temperatures.mean()), "std": std, "bands": remaining}
-    return warned(corrected.assign(counts=result).assign_attrs(level_reference=level), *notes)
+    return schema.warned(corrected.assign(counts=film).assign_attrs(level_reference=level), *notes)

@@ -17,7 +17,7 @@ from scipy.special import chdtri
 from dbthermal import _numbers, _rows, _text, schema, store
 from dbthermal import response as responses
 from dbthermal._arrays import Array, Mask, empty, on_disk, quotient, release
-from dbthermal._coordinates import laid_on
+from dbthermal.schema import laid_on
 
 Values = npt.NDArray[np.float32]
 Progress = Callable[[str, float], object]

@@ -198,7 +198,7 @@ def test_maker_constants_are_checked(key: str, value: float | None, message: str
     with pytest.raises(ValueError, match=message):
         calibration.maker_response({"8-14": attrs})
     for kind, files in {"float": attrs, "list": [attrs]}.items():
-        with pytest.raises(TypeError, match=f"type {kind}. Must be a mapping: attributes by band"):
+        with pytest.raises(TypeError, match=f"band of type {kind}. Must be a Mapping"):
             calibration.maker_response(files)  # type: ignore[arg-type]
 
 
