@@ -75,6 +75,9 @@ class Curve:
 
     .. math:: U(T) = \frac{C}{\exp(c_2 / (A T + B)) - 1} + O
 
+    (1982, in Temperature: its Measurement and Control in Science and Industry 5, 421-427; Saunders,
+    White 2003, doi:10.1088/0026-1394/40/4/309).
+
     Attributes
     ----------
     band : str
@@ -83,12 +86,6 @@ class Curve:
         C [count], A (effective wavelength) [m], B [m K] and O [count].
     reference, lowest, highest : float
         Reference temperature :math:`T_r`, and calibrated range [K].
-
-    References
-    ----------
-    .. [1] Sakuma, Hattori (1982), in Temperature: its Measurement and Control in Science and
-       Industry 5, 421-427
-    .. [2] Saunders, White (2003), Metrologia 40, 195, doi:10.1088/0026-1394/40/4/309
     """
 
     band: str

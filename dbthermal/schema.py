@@ -511,15 +511,18 @@ def require(data: object, kinds: type | tuple[type, ...], label: str) -> None:
 def _check_coordinate(array: xr.DataArray, dim: str, label: str) -> None:
     if dim not in array.coords:
         raise ValueError(f"Missing coordinate '{dim}' of {label}. Must be given.")
-    units = COORDINATES[dim].units
-    values = check_numbers(array[dim], f"'{dim}' of {label}", units).values.astype(np.float64)
-    steps = np.diff(values)
+    units, label = COORDINATES[dim].units, f"'{dim}' of {label}"
+    require_rising(check_numbers(array[dim], label, units).values.astype(np.float64), label, units)
+
+
+def require_rising(values: npt.NDArray[np.float64], label: str, units: str) -> None:
+    """Refuse values that are not finite, or do not increase strictly."""
     if not np.all(np.isfinite(values)):
-        raise ValueError(f"Invalid '{dim}' of {label}: not finite. Must be finite.")
-    if np.any(steps <= 0):
-        place = int(np.argmax(steps <= 0))
+        raise ValueError(f"Invalid {label}: not finite. Must be finite.")
+    if np.any(wrong := np.diff(values) <= 0):
+        place = int(np.argmax(wrong))
         pair = f"{values[place]} {units} is followed by {values[place + 1]} {units}"
-        raise ValueError(f"Unordered '{dim}' of {label}: {pair}. Must increase strictly.")
+        raise ValueError(f"Unordered {label}: {pair}. Must increase strictly.")
 
 
 def pixel_status(capture: xr.Dataset) -> npt.NDArray[np.uint32]:

@@ -153,14 +153,16 @@ def fit_emissivity(
     r"""Emissivity of a material per band, by contact thermometry and a reflected blackbody.
 
     Each measurement i has counts :math:`I_i`, the object's temperature by thermocouple and the
-    reflected blackbody's temperature (equation 10 of the paper [1]_, by least squares):
+    reflected blackbody's temperature (equation 10 of Narayanan, Ramanagopal, Narasimhan 2026,
+    doi:10.48550/arXiv.2509.11334, by least squares):
 
     .. math:: I_i - U(T_{b,i}) = e \, (U(T_{o,i}) - U(T_{b,i}))
 
     weighted by the covariance of both sides, iterated in e: the independent part :math:`s_i^2 =
     s_I^2 + (e U'(T_o) s_o)^2 + ((1-e) U'(T_b) s_b)^2`, and for each common error the outer product
-    of its effects [2]_. The differences on the right are weighted as the fit adjusts them [3]_,
-    because their scatter would pass for contrast.
+    of its effects (Aitken 1936, doi:10.1017/S0370164600014346). The differences on the right are
+    weighted as the fit adjusts them (York et al. 2004, doi:10.1119/1.1632486), because their
+    scatter would pass for contrast.
 
     Parameters
     ----------
@@ -181,13 +183,6 @@ def fit_emissivity(
         there are fewer than two measurements, a temperature lies outside the response, object and
         background differ by less than three standard deviations, a result lies outside
         `schema.EMISSIVITY_LIMITS` by more than three, or the fit does not converge.
-
-    References
-    ----------
-    .. [1] Narayanan, Ramanagopal, Narasimhan (2026), doi:10.48550/arXiv.2509.11334
-    .. [2] Aitken (1936), Proceedings of the Royal Society of Edinburgh 55, 42,
-       doi:10.1017/S0370164600014346
-    .. [3] York et al. (2004), American Journal of Physics 72, 367, doi:10.1119/1.1632486
 
     Examples
     --------
@@ -223,10 +218,10 @@ def fit_emissivity(
 def reflector_emissivity(
     measured: xr.Dataset, response: xr.Dataset, reading_std: Pair, bias: Bias = NO_BIAS
 ) -> xr.Dataset:
-    r"""Emissivity of a material per band by the reflector method of the standards.
+    r"""Emissivity of a material per band by the reflector method of ISO 18434-1, ASTM E1862, E1933.
 
     A crumpled foil in the object's place gives the reflected signal :math:`W_r`, a contact
-    thermometer the object's own :math:`W_o = U(T_o)`, and the camera the object's W [1]_ [2]_:
+    thermometer the object's own :math:`W_o = U(T_o)`, and the camera the object's W:
 
     .. math:: e = \frac{W - W_r}{W_o - W_r}, \qquad
               s_e = \frac{\sqrt{s_W^2 + e^2 s_{W_o}^2 + (1 - e)^2 s_{W_r}^2}}{|W_o - W_r|}
@@ -250,11 +245,6 @@ def reflector_emissivity(
     Dataset
         As `fit_emissivity`, and its errors, but one measurement is enough: the reduced chi-square
         is then NaN.
-
-    References
-    ----------
-    .. [1] ISO 18434-1:2008, Condition monitoring and diagnostics of machines, Thermography
-    .. [2] ASTM E1862, reflected temperature; ASTM E1933, emissivity
 
     Examples
     --------

@@ -57,9 +57,9 @@ def fit_response(  # noqa: PLR0913 - what is known of blackbody and cameras, by 
 
     .. math:: U(T) = \frac{C}{\exp(c_2 / (A T + B)) - 1} + O, \qquad U(T) \approx a T + b
 
-    the Sakuma-Hattori curve [1]_ and the least-squares line. C and O enter linearly and are
-    eliminated [2]_; A and B are found by nonlinear least squares, with the mean wavelength
-    A + B / T within the band.
+    the Sakuma-Hattori curve (see `response.Curve`) and the least-squares line. C and O enter
+    linearly and are eliminated (Golub, Pereyra 2003, doi:10.1088/0266-5611/19/2/201); A and B are
+    found by nonlinear least squares, with the mean wavelength A + B / T within the band.
 
     Counts are refused whose n residuals r are larger than noise s, rounding and the error of the
     blackbody explain, of good counts once in 1e4 sweeps:
@@ -103,12 +103,6 @@ def fit_response(  # noqa: PLR0913 - what is known of blackbody and cameras, by 
         linear in temperature; the error names the temperature. UserWarning if the NETD of a band of
         `bands.FILTERS` is less than half that of one that contains it: then their names or files
         may be exchanged.
-
-    References
-    ----------
-    .. [1] Sakuma, Hattori (1982), in Temperature: its Measurement and Control in Science and
-       Industry 5, 421-427
-    .. [2] Golub, Pereyra (2003), Inverse Problems 19, R1, doi:10.1088/0266-5611/19/2/201
 
     Examples
     --------

@@ -24,8 +24,16 @@ from dbthermal.correction._nonuniformity import (
     renew_offset,
 )
 from dbthermal.correction._pixels import mark_bad, mark_repeats
-from dbthermal.correction._shutter import distinct, events_of, find_shutter, mark_shutter
-from dbthermal.correction._temporal import Reference, refer, undo_drift, undo_lag
+from dbthermal.correction._temporal import (
+    Reference,
+    distinct,
+    events_of,
+    find_shutter,
+    mark_shutter,
+    refer,
+    undo_drift,
+    undo_lag,
+)
 
 __all__ = [
     "DETECTOR_MAXIMUM",

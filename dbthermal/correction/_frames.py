@@ -16,7 +16,7 @@ import xarray as xr
 from dbthermal import _samples, schema
 from dbthermal._arrays import Array, Mask, stride
 from dbthermal.correction._nonuniformity import OUTLIER
-from dbthermal.correction._shutter import FEWEST_COPIES
+from dbthermal.correction._temporal import FEWEST_COPIES
 from dbthermal.noise import MAD, MINIMUM_FRAMES
 
 Film = npt.NDArray[np.float32]

@@ -199,8 +199,7 @@ def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
         raise ValueError(f"Invalid dims {flat.dims} of the flat image. {rule}.")
     flat = schema.laid_on(flat, correction, "the flat image", "the correction")
     good = ~correction["bad"].values
-    if not np.all(schema.measured(flat.values[good])):
-        raise ValueError("Invalid flat image: a good pixel is not finite. Must be finite.")
+    schema.require_measured(flat.values[good], "flat image, in a good pixel")
     gain, offset = correction["gain"].values, correction["offset"].values
     corrected = gain * flat.values.astype(np.float64) + offset
     # Offsets that bring every good pixel to the mean.

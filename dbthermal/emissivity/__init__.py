@@ -123,8 +123,10 @@ def band_table(
 def embedded_table() -> xr.Dataset:
     """Table of 25 common materials that comes with the package.
 
-    Rounded averages at 300 K over `bands.FILTERS`, made by `band_table` from three public libraries
-    [1]_ [2]_ [3]_, whose spectra are not redistributed.
+    Rounded averages at 300 K over `bands.FILTERS`, made by `band_table` from three public
+    libraries, whose spectra are not redistributed: Baldridge et al. (2009,
+    doi:10.1016/j.rse.2008.11.007), Meerdink et al. (2019, doi:10.1016/j.rse.2019.05.015) and
+    Kotthaus et al. (2014, doi:10.1016/j.isprsjprs.2014.05.005).
 
     Returns
     -------
@@ -132,12 +134,6 @@ def embedded_table() -> xr.Dataset:
         Stage `emissivity_table`: `emissivity` and `coverage` (material, band) [1]; some metals and
         tiles were measured up to 12.5 um only. Coordinates `library` and `source` (material) name
         the library, and the file or sample in it.
-
-    References
-    ----------
-    .. [1] Baldridge et al. (2009), doi:10.1016/j.rse.2008.11.007
-    .. [2] Meerdink et al. (2019), doi:10.1016/j.rse.2019.05.015
-    .. [3] Kotthaus et al. (2014), doi:10.1016/j.isprsjprs.2014.05.005
 
     Examples
     --------

@@ -44,10 +44,12 @@ def bounds(
 ) -> xr.Dataset:
     r"""Cramer-Rao bounds of all quantities that can be estimated from one pixel's capture.
 
-    The inverse Fisher information [1]_ of :math:`z_m(t) = e_m u_m(x(t)) + (1 - e_m) u_m(y(t))` +
-    white noise :math:`s_m` at the truth. Unknown are every :math:`e_m`; x, in a smooth subspace of
-    polynomials of time; y, one number a frame, eliminated by variable projection [2]_, and in the
-    frames at rest one number for all. Response and noise are known.
+    The inverse Fisher information (Kay 1993, Fundamentals of Statistical Signal Processing:
+    Estimation Theory, chapter 3) of :math:`z_m(t) = e_m u_m(x(t)) + (1 - e_m) u_m(y(t))` + white
+    noise :math:`s_m` at the truth. Unknown are every :math:`e_m`; x, in a smooth subspace of
+    polynomials of time; y, one number a frame, eliminated by variable projection (Golub, Pereyra
+    2003, doi:10.1088/0266-5611/19/2/201), and in the frames at rest one number for all. Response
+    and noise are known.
 
     Parameters
     ----------
@@ -90,11 +92,6 @@ def bounds(
     sample. Frames at rest determine the emissivities, and sharpen the ratio; the curvature of the
     exact response determines them without, but hardly, and the bound of the ratio is then loose. An
     `emissivity_std` of 0.29, that of a uniform number in (0, 1), tightens it.
-
-    References
-    ----------
-    .. [1] Kay (1993), Fundamentals of Statistical Signal Processing: Estimation Theory, chapter 3
-    .. [2] Golub, Pereyra (2003), Inverse Problems 19, R1, doi:10.1088/0266-5611/19/2/201
 
     Examples
     --------
@@ -150,8 +147,7 @@ def _truth(scene: xr.Dataset, *, resting: bool) -> _fisher.Truth:
         scene[name].values.astype(np.float64).reshape(scene[name].shape[0], -1) for name in names
     )
     for name, values in zip(names[:2], (temperature, background), strict=True):
-        if not np.all(schema.measured(values)):
-            raise ValueError(f"Invalid {name} of the scene: not finite. Must be in kelvin.")
+        schema.require_measured(values, f"{name} of the scene")
     if len(emissivity) < 2:
         raise ValueError("Invalid scene of one band. Must have at least two.")
     bad = ~((emissivity > 0) & (emissivity < 1))

@@ -78,7 +78,7 @@ class Background:
 
     def draw(self, time: Array, pixels: int, rng: np.random.Generator) -> Array:
         """Background temperature (time, pixel) [K], one realisation a pixel, at times [s]."""
-        increasing(time, "a background")
+        _check_times(time, "a background")
         change = np.zeros((time.size, pixels))
         if self.kind == "pulses":
             number = rng.integers(self.count[0], self.count[1] + 1, pixels)
@@ -89,19 +89,15 @@ class Background:
                 # Pulses beyond the pixel's number are drawn, but not added.
                 change += self.amplitude * (active & (pulse < number))
         elif self.kind == "random walk":
-            change = self._walk(time, pixels, rng)
+            change[0] = rng.standard_normal(pixels)
+            for frame in range(1, time.size):
+                # AR(1) of unit variance: correlation exp(-dt / correlation_time) from the last.
+                kept = np.exp(-(time[frame] - time[frame - 1]) / self.correlation_time)
+                fresh = np.sqrt(1.0 - kept**2) * rng.standard_normal(pixels)
+                change[frame] = kept * change[frame - 1] + fresh
+            change = self.amplitude * change
         ramp = self.drift * (time - time[0]) / (time[-1] - time[0])
         return np.asarray(self.level + ramp[:, np.newaxis] + change)
-
-    def _walk(self, time: Array, pixels: int, rng: np.random.Generator) -> Array:
-        change = np.empty((time.size, pixels))
-        change[0] = rng.standard_normal(pixels)
-        for frame in range(1, time.size):
-            # AR(1) of unit variance: correlation exp(-dt / correlation_time) from frame to frame.
-            kept = np.exp(-(time[frame] - time[frame - 1]) / self.correlation_time)
-            fresh = np.sqrt(1.0 - kept**2) * rng.standard_normal(pixels)
-            change[frame] = kept * change[frame - 1] + fresh
-        return self.amplitude * change
 
 
 def heating(time: Array, start: float, stop: float, time_constant: npt.ArrayLike) -> Array:
@@ -124,7 +120,7 @@ def heating(time: Array, start: float, stop: float, time_constant: npt.ArrayLike
     >>> heating(np.array([0.0, 10.0, 20.0]), 293.15, 313.15, 10.0).round(2).tolist()
     [293.15, 307.77, 313.15]
     """
-    increasing(time, "a heating")
+    _check_times(time, "a heating")
     constant = planck.require_positive("time_constant [s]", time_constant)
     elapsed = (time - time[0]).reshape(-1, *(1,) * constant.ndim)
     # expm1 keeps the digits of a capture that is short against the time constant.
@@ -149,7 +145,7 @@ def scene(
     Dataset
         Names, dims and units of the stage `separated` without its deviations.
     """
-    increasing(time, "a scene")
+    _check_times(time, "a scene")
     planck.require_positive("object_temperature [K]", object_temperature)
     planck.require_positive("background_temperature [K]", background_temperature)
     schema.check_numbers(emissivity, "the emissivity", "1")
@@ -277,17 +273,12 @@ def walkers(
     return scene(time, warm, cold, emissivity)
 
 
-def increasing(times: npt.ArrayLike, name: str) -> Array:
-    """Checked times (time,) [s] of a named thing: two or more, finite, increasing."""
+def _check_times(times: npt.ArrayLike, name: str) -> None:
+    """Refuse times (time,) [s] of a named thing that are not two or more, and increasing."""
     array = _numbers.real_numbers(f"times [s] of {name}", times)
     if array.ndim != 1 or array.size < 2:
         raise ValueError(f"Invalid times of shape {array.shape} of {name}. Must be two or more.")
-    # A NaN fails the comparison, too.
-    wrong = np.flatnonzero(~np.isfinite(array) | ~(np.diff(array, prepend=-np.inf) > 0))
-    if wrong.size:
-        rule = "Must be finite, and increase strictly"
-        raise ValueError(f"Invalid time {array[wrong[0]]} s of {name}. {rule}.")
-    return array
+    schema.require_rising(array, f"times of {name}", "s")
 
 
 @dataclass(frozen=True)
