@@ -199,13 +199,13 @@ def fit_emissivity(
     >>> fit_emissivity(measured, camera, reading_std=(0.1, 0.05)).emissivity.values.round(3)
     array([0.85, 0.85])
     """
-    warm, stds = _readings(measured, "contact", reading_std, bias)
+    warm, stds, bands = _readings(measured, response, "contact", reading_std, bias)
     if measured.sizes["measurement"] < 2:
         raise ValueError("Invalid number of measurements 1. Must be at least 2.")
     cold = measured["background_temperature"].values.astype(np.float64)
     _require_contrast(warm - cold, stds, "background")
     signals = {}
-    for curve, noise, counts in _bands(measured, response, warm):
+    for curve, noise, counts in bands:
         require_range(cold, curve, "background temperature")
         reflected = _covariance(*bias.reflected(curve, cold, float(stds[1])))
         emitted = curve.counts(warm), _covariance(*bias.emitted(curve, warm, float(stds[0])))
@@ -261,10 +261,10 @@ def reflector_emissivity(
     >>> reflector_emissivity(measured, camera, reading_std=(0.2, 0.3)).emissivity.values.round(3)
     array([0.3, 0.3])
     """
-    warm, stds = _readings(measured, "reflector", reading_std, bias)
+    warm, stds, bands = _readings(measured, response, "reflector", reading_std, bias)
     signals = {}
     foils = measured["reflected_counts"].values.astype(np.float64)
-    for (curve, noise, counts), foil in zip(_bands(measured, response, warm), foils, strict=True):
+    for (curve, noise, counts), foil in zip(bands, foils, strict=True):
         cold = curve.inverse(foil)
         _require_contrast(warm - cold, stds, f"reflection in band '{curve.band}'")
         emitted = curve.counts(warm), _covariance(*bias.emitted(curve, warm, float(stds[0])))
@@ -274,25 +274,20 @@ def reflector_emissivity(
 
 
 def _readings(
-    measured: xr.Dataset, stage: str, reading_std: Pair, bias: Bias
-) -> tuple[Array, Array]:
-    """Check the readings; corrected object temperature [K], and deviations of a reading [K]."""
+    measured: xr.Dataset, response: xr.Dataset, stage: str, reading_std: Pair, bias: Bias
+) -> tuple[Array, Array, list[tuple[Curve, float, Array]]]:
+    """Object temperature (n) and deviations of a reading [K]; curve, noise, counts (n) by band."""
     schema.check(measured, stage)
     for name, variable in measured.data_vars.items():
         schema.require_measured(variable.values, str(name))
     warm = bias.corrected(measured["object_temperature"].values.astype(np.float64))
-    return warm, _numbers.real_numbers("reading_std [K]", reading_std, _numbers.POSITIVE, (2,))
-
-
-def _bands(
-    measured: xr.Dataset, response: xr.Dataset, warm: Array
-) -> list[tuple[Curve, float, Array]]:
-    """Response, noise and counts (measurement) of each band."""
+    stds = _numbers.real_numbers("reading_std [K]", reading_std, _numbers.POSITIVE, (2,))
     names = [str(name) for name in measured["band"].values]
     noises, curves = responses.noise(response, names).tolist(), responses.curves(response, names)
     for curve in curves:
         require_range(warm, curve, "object temperature")
-    return list(zip(curves, noises, measured["counts"].values.astype(np.float64), strict=True))
+    counts = measured["counts"].values.astype(np.float64)
+    return warm, stds, list(zip(curves, noises, counts, strict=True))
 
 
 def _covariance(std: Array, bias: Array) -> Array:

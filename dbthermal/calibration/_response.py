@@ -385,9 +385,5 @@ def _constant(attrs: Any, key: str, band: str, *, positive: bool = True) -> floa
     if f"file_{key}" not in attrs:
         rule = "Must be in the file, as in FLIR's: else fit a blackbody, by fit_response"
         raise ValueError(f"Missing {key} of band '{band}'. {rule}.")
-    value = float(attrs[f"file_{key}"])
-    if positive:
-        planck.require_positive(f"{key} of band '{band}'", value)
-    elif not np.isfinite(value):
-        raise ValueError(f"Invalid {key} of band '{band}' {value}. Must be finite.")
-    return value
+    limits = _numbers.POSITIVE if positive else _numbers.FINITE
+    return _numbers.real_number(f"{key} of band '{band}'", float(attrs[f"file_{key}"]), limits)

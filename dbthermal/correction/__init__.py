@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from dbthermal import _numbers, _rows, schema
+from dbthermal import _arrays, _numbers, schema
 from dbthermal._arrays import Mask
 from dbthermal.correction._frames import sampling, unreported
 from dbthermal.correction._nonuniformity import (
@@ -206,7 +206,7 @@ def correct_capture(  # noqa: PLR0913 - the options of each step, by name
 
 def _by_rows(measured: Callable[..., xr.Dataset], raw: xr.DataArray) -> xr.Dataset:
     """Correct block by block of rows, with counts that are computed when they are read."""
-    blocks = [measured(rows).drop_vars("counts") for rows in _rows.blocks(raw.shape)]
+    blocks = [measured(rows).drop_vars("counts") for rows in _arrays.blocks(raw.shape)]
     rule: Any = {"data_vars": "minimal", "coords": "minimal", "compat": "override"}
     whole = xr.concat(blocks, "y", combine_attrs="override", **rule)
     if "pattern_std" in whole:
@@ -215,7 +215,7 @@ def _by_rows(measured: Callable[..., xr.Dataset], raw: xr.DataArray) -> xr.Datas
         if len(finite):
             whole["pattern_std"].values[:] = np.sqrt(np.mean(finite, axis=0))
     like = raw.assign_attrs(schema.STAGES["corrected"]["counts"].attrs)
-    counts = _rows.by_pixels(lambda *window: measured(*window)["counts"].values, like)
+    counts = _arrays.by_pixels(lambda *window: measured(*window)["counts"].values, like)
     dead = sum(block.attrs["dead_pixels"] for block in blocks)
     return whole.assign(counts=counts).assign_attrs(dead_pixels=dead)
 

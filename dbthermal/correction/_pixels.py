@@ -10,7 +10,7 @@ import numpy.typing as npt
 import xarray as xr
 from scipy.ndimage import maximum_filter1d, median_filter
 
-from dbthermal import _numbers, _rows, _samples, schema
+from dbthermal import _arrays, _numbers, _samples, schema
 from dbthermal._arrays import Array, Mask, quotient
 from dbthermal.correction._nonuniformity import OUTLIER, outlying
 from dbthermal.noise import MAD, MINIMUM_FRAMES
@@ -109,7 +109,7 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
         segments = np.unique(segment_numbers)
         # Noise and mean picture of each pixel, some at a time.
         level, still = np.empty(image), np.empty((segments.size, *image))
-        for window in _rows.windows(movie.shape, _BLOCK):
+        for window in _arrays.windows(movie.shape, _BLOCK):
             block = _measured(movie, *window)
             level[window] = _samples.noise(block)
             still[:, *window] = [_mean(block[segment_numbers == number]) for number in segments]
@@ -190,7 +190,7 @@ def _repeats(movie: xr.DataArray, frames: Mask) -> tuple[Mask, Mask]:
     middle = movie.isel(y=image[0] // 2, x=slice(None, None, step)).values
     grain = _samples.grain(middle, np.ones(middle.shape, dtype=bool))
     (clipped, frozen), ends = np.zeros((2, *image), dtype=bool), np.zeros((2, 3, *image))
-    for rows, columns in _rows.windows(movie.shape, _BLOCK):
+    for rows, columns in _arrays.windows(movie.shape, _BLOCK):
         counts = movie.isel(y=rows, x=columns).values.reshape(len(movie), -1)
         shape = (-1, columns.stop - columns.start)
         valid = np.broadcast_to(frames[:, np.newaxis], counts.shape)
@@ -213,7 +213,7 @@ def _repeats(movie: xr.DataArray, frames: Mask) -> tuple[Mask, Mask]:
 def _frames(movie: xr.DataArray, fewest: int) -> npt.NDArray[np.int64]:
     """Indices of the frames of a band that are not NaN."""
     finite = np.zeros(movie.sizes["time"], dtype=bool)
-    for rows, columns in _rows.windows(movie.shape, _BLOCK):
+    for rows, columns in _arrays.windows(movie.shape, _BLOCK):
         finite |= np.isfinite(movie.isel(y=rows, x=columns).values).any(axis=(1, 2))
     if finite.sum() < fewest:
         step = float(np.median(np.diff(movie["time"].values))) if finite.size > 1 else np.nan
@@ -234,7 +234,7 @@ def _measured(movie: xr.DataArray, rows: slice, columns: slice) -> Single:
 def _jumps(movie: xr.DataArray, limit: Array, stepped: Mask, reach: int) -> Mask:
     """Pixels (y, x) that change by more than their limit [count] while no neighbour does."""
     jumping = np.zeros(limit.shape, dtype=bool)
-    for rows, columns in _rows.windows(movie.shape, _BLOCK):
+    for rows, columns in _arrays.windows(movie.shape, _BLOCK):
         # A pixel at the edge of a block needs its neighbours in the next one.
         top, start = max(rows.start - 1, 0), max(columns.start - 1, 0)
         wide = slice(top, rows.stop + 1), slice(start, columns.stop + 1)

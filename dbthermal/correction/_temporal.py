@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from dbthermal import _numbers, _rows, _smooth, schema
+from dbthermal import _arrays, _numbers, _smooth, schema
 from dbthermal import response as responses
 from dbthermal._arrays import Array, Mask, stride
 
@@ -211,7 +211,7 @@ def copies(counts: xr.DataArray) -> Mask:
         repeats[candidates] = True
         needed = np.union1d(candidates, candidates - 1)
         after, before = (np.searchsorted(needed, frame) for frame in (candidates, candidates - 1))
-        for rows in _rows.blocks((needed.size, *counts.shape[1:]), _BLOCK):
+        for rows in _arrays.blocks((needed.size, *counts.shape[1:]), _BLOCK):
             block = counts.isel(time=needed, y=rows).values
             repeats[candidates] &= ~_changed(block[before], block[after])[0].any(axis=(1, 2))
     return repeats
@@ -367,7 +367,7 @@ def undo_drift(
                 curve[frames] = fitted - fitted[0]  # change since the segment's first frame
 
     drifts = curves[..., np.newaxis, np.newaxis]
-    undo = _rows.changed(counts, lambda values: values - drifts, lazy=lazy)
+    undo = _arrays.changed(counts, lambda values: values - drifts, lazy=lazy)
     drift = schema.variables("corrected", {"drift": curves})
     return corrected.assign(counts=undo, **drift).assign_attrs(
         drift_order=order, drift_pixels=len(rows)
@@ -458,6 +458,6 @@ def refer(corrected: xr.Dataset, reference: Reference, *, lazy: bool) -> xr.Data
             label = f"Patch {patch} of {temperatures[patch]:.6g} K reads about {off[patch]:+.2g} K"
             label += f" off in band '{names[band]}', {times[patch]:.0f} deviations of its response"
             notes.append(f"{label}. Must be black, and right: all levels follow it.")
-    film = _rows.changed(counts, lambda values: lines[0] * values + lines[1], lazy=lazy)
+    film = _arrays.changed(counts, lambda values: lines[0] * values + lines[1], lazy=lazy)
     level = {"temperature": float(temperatures.mean()), "std": std, "bands": remaining}
     return schema.warned(corrected.assign(counts=film).assign_attrs(level_reference=level), *notes)

@@ -215,9 +215,8 @@ def chosen_bands(bands: Bands) -> list[Band]:
     if isinstance(bands, (str, Band)):
         bands = [bands]
     listed = list(bands.values()) if isinstance(bands, Mapping) else list(bands)
-    odd = [band for band in listed if not isinstance(band, (str, Band))]
-    if odd:
-        raise TypeError(f"Invalid band {odd[0]!r}. Must be a Band, or the name of a filter.")
+    for band in listed:
+        schema.require(band, (str, Band), f"band {band!r:.60}")
     chosen = [get(band) if isinstance(band, str) else band for band in listed]
     names = [band.name for band in chosen]
     if not chosen or len(set(names)) < len(names):
