@@ -456,7 +456,11 @@ def check_variable(array: xr.DataArray, variable: Variable, label: str) -> None:
         if dim == "band":
             band_positions(array, [], label)
         elif dim in COORDINATES:
-            _check_coordinate(array, str(dim), label)
+            if dim not in array.coords:
+                raise ValueError(f"Missing coordinate '{dim}' of {label}. Must be given.")
+            units, name = COORDINATES[str(dim)].units, f"'{dim}' of {label}"
+            values = check_numbers(array[dim], name, units).values.astype(np.float64)
+            require_rising(values, name, units)
 
 
 def check_numbers(array: xr.DataArray, label: str, units: str | None = None) -> xr.DataArray:
@@ -508,13 +512,6 @@ def require(data: object, kinds: type | tuple[type, ...], label: str) -> None:
         raise TypeError(f"{message}. Must be a {' or a '.join(names)}.")
 
 
-def _check_coordinate(array: xr.DataArray, dim: str, label: str) -> None:
-    if dim not in array.coords:
-        raise ValueError(f"Missing coordinate '{dim}' of {label}. Must be given.")
-    units, label = COORDINATES[dim].units, f"'{dim}' of {label}"
-    require_rising(check_numbers(array[dim], label, units).values.astype(np.float64), label, units)
-
-
 def require_rising(values: npt.NDArray[np.float64], label: str, units: str) -> None:
     """Refuse values that are not finite, or do not increase strictly."""
     if not np.all(np.isfinite(values)):
@@ -527,22 +524,20 @@ def require_rising(values: npt.NDArray[np.float64], label: str, units: str) -> N
 
 def pixel_status(capture: xr.Dataset) -> npt.NDArray[np.uint32]:
     """Bits of `Status` of each pixel (y, x), 0 without a variable `status`."""
-    if "status" not in capture:
-        return np.zeros((capture.sizes["y"], capture.sizes["x"]), dtype=np.uint32)
-    return np.asarray(capture["status"].values, dtype=np.uint32)
+    good = np.zeros((capture.sizes["y"], capture.sizes["x"]))
+    return np.asarray(capture.get("status", good), dtype=np.uint32)
 
 
 def segments(capture: xr.Dataset) -> npt.NDArray[np.intp]:
     """Number of shutter events before each frame (time), 0 without a variable `segment`."""
-    if "segment" not in capture:
-        return np.zeros(capture.sizes["time"], dtype=np.intp)
-    return np.asarray(capture["segment"].values, dtype=np.intp)
+    without = np.zeros(capture.sizes["time"])
+    return np.asarray(capture.get("segment", without), dtype=np.intp)
 
 
 def noise_factor(capture: xr.Dataset) -> npt.NDArray[np.float64]:
     """Noise (band) [1] over that before an alignment, 1 without a variable `noise_factor`."""
-    whole = xr.DataArray(np.ones(capture.sizes["band"]), dims="band")
-    return np.asarray(capture.get("noise_factor", whole).values, dtype=np.float64)
+    whole = np.ones(capture.sizes["band"])
+    return np.asarray(capture.get("noise_factor", whole), dtype=np.float64)
 
 
 def laid_on(

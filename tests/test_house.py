@@ -12,7 +12,7 @@ HOUSE = Path(dbthermal.__file__).parent
 BUDGET = {
     "": (3459, 15),
     "_cli": (1257, 5),
-    "alignment": (2821, 10),
+    "alignment": (2822, 10),
     "calibration": (740, 2),
     "correction": (1706, 5),
     "emissivity": (411, 1),
@@ -22,7 +22,7 @@ BUDGET = {
     "limits": (686, 2),
     "readers": (2663, 10),
     "reporting": (392, 1),
-    "separation": (12856, 54),
+    "separation": (12863, 54),
     "simulation": (542, 1),
     "store": (1372, 6),
 }
