@@ -203,8 +203,10 @@ def accuracy(
     limits = {"blackbody_emissivity": (1e-3, 1.0), "room_temperature": _numbers.KELVIN}
     limits |= {"gain_std": (0.0, 1.0), "background_ratio_std": (0.0, 1.0)}  # relative, not in %
     for name, default in ACCURACY.items():
-        value, within = response.get(name, default), limits.get(name, (0.0, schema.LARGEST))
-        stated[name] = _numbers.real_numbers(f"{name} of the response", value, within)
+        value = np.asarray(response.get(name, default), np.float64)
+        stated[name], within = value, limits.get(name, (0.0, schema.LARGEST))
+        if not np.all((value >= within[0]) & (value <= within[1])):
+            _numbers.real_numbers(f"{name} of the response", value, within)  # says which and why
     offset, gain, pattern = (
         np.broadcast_to(stated[name], response.sizes["band"])[places]
         for name in ("offset_std", "gain_std", "pattern_std")
@@ -303,8 +305,10 @@ def noise(response: xr.Dataset, bands: list[str]) -> Array:
         raise ValueError("Missing noise of the response. Must be given to fit_response.")
     places = schema.band_positions(response, bands, "the response")
     values = np.asarray(response["noise"].values[places], dtype=np.float64)
-    for band, value in zip(bands, values, strict=True):
-        _numbers.real_number(f"noise [count] in band '{band}'", value, _numbers.POSITIVE)
+    bad = ~((values > 0) & np.isfinite(values))
+    if np.any(bad):
+        label = f"Invalid noise [count] {values[bad][0]} in band '{bands[int(np.argmax(bad))]}'"
+        raise ValueError(f"{label}. Must be finite and positive.")
     return values
 
 

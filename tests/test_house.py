@@ -10,11 +10,11 @@ HOUSE = Path(dbthermal.__file__).parent
 
 # Lines and modules that a room may have. A room that grows takes from another; these only fall.
 BUDGET = {
-    "": (3459, 15),
+    "": (3458, 15),
     "_cli": (1257, 5),
     "alignment": (2822, 10),
     "calibration": (740, 2),
-    "correction": (1706, 5),
+    "correction": (1704, 5),
     "emissivity": (411, 1),
     "explorer": (1264, 6),
     "figures": (579, 2),
@@ -23,10 +23,10 @@ BUDGET = {
     "readers": (2663, 10),
     "reporting": (392, 1),
     "separation": (12863, 54),
-    "simulation": (542, 1),
-    "store": (1372, 6),
+    "simulation": (541, 1),
+    "store": (1366, 6),
 }
-INSTALLED = 35_992  # lines of all rooms
+INSTALLED = 35_982  # lines of all rooms
 
 PRONOUNS = {
     *("one", "other", "others", "own", "part", "parts", "some", "here", "there", "told", "known"),

@@ -26,8 +26,8 @@ _SAMPLE = 4096  # pixels on an even grid that are compared first
 _BLOCK = 4_000_000  # samples of a block of rows
 _EVENT = ("band", "first_frame", "frames", "renewed")
 _LONGEST = 1.0  # time constant of a pixel [s]; of microbolometers it is some 10 ms
-_PATCH = schema.Variable(("y", "x"), "bool", "1", "patch of constant temperature")
 _DOUBTED = 5.0  # deviations of a calibration, by default 0.5 K, that no drift explains (20 K: 39)
+_PATCH = schema.Variable(("y", "x"), "bool", "1", "patch of constant temperature")
 _PATCHES = schema.Variable(("patch", "y", "x"), "bool", "1", "pixels of a patch")
 
 

@@ -15,7 +15,6 @@ import xarray as xr
 from dbthermal import _numbers, _text, bands, calibration, correction, mixing, planck, schema
 from dbthermal import response as responses
 from dbthermal._arrays import Array
-from dbthermal.response import require_range
 
 __all__ = [
     "Background",
@@ -358,7 +357,7 @@ def _blackbody(response: xr.Dataset, temperature: xr.DataArray) -> list[np.ndarr
         levels = [temperature.isel(band=place) for place in places]
     curves = responses.curves(response, names)
     return [
-        curve.counts(require_range(level.values, curve, str(temperature.name)))
+        curve.counts(responses.require_range(level.values, curve, str(temperature.name)))
         for level, curve in zip(levels, curves, strict=True)
     ]
 
