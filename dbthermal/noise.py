@@ -33,13 +33,8 @@ _CORRELATION_STD = np.sqrt(35.0 / 18.0)
 
 def second_difference(signal: Array, time: npt.ArrayLike) -> Array:
     """Second difference in time of signals (time, pixel); white noise keeps its variance."""
-    signal = _numbers.real_numbers("signal", signal)
-    if np.any(np.isinf(signal)):
-        raise ValueError("Invalid signal: infinite. Must be finite, or NaN.")
     time = _numbers.real_numbers("time [s]", time, shape=signal.shape[:1])
-    if np.any(bad := ~(np.diff(time) > 0.0)):
-        place = int(np.argmax(bad))
-        raise ValueError(f"Invalid time {time[place + 1]} s after {time[place]} s. Must rise.")
+    schema.require_rising(time, "time", "s")
     # Samples less the line through both neighbours, over the root of the sum of squared weights.
     before = ((time[2:] - time[1:-1]) / (time[2:] - time[:-2]))[:, np.newaxis]
     line = before * signal[:-2] + (1.0 - before) * signal[2:]

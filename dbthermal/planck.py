@@ -101,13 +101,7 @@ def brightness_temperature(wavelength: npt.ArrayLike, radiance: npt.ArrayLike) -
     wavelength, radiance : array_like
         Wavelength [m] and spectral radiance [W m^-2 sr^-1 m^-1].
 
-    Examples
-    --------
-    A surface of emissivity 0.9 at 300 K that reflects nothing.
-
-    >>> radiance = 0.9 * spectral_radiance(10e-6, 300.0)
-    >>> round(float(brightness_temperature(10e-6, radiance)), 1)  # [K]
-    293.6
+    See the example of `spectral_radiance`.
     """
     wavelength = require_positive("wavelength [m]", wavelength)
     radiance = require_positive("spectral radiance [W m^-2 sr^-1 m^-1]", radiance)

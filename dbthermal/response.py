@@ -52,16 +52,12 @@ ACCURACY: Final[Mapping[str, float]] = MappingProxyType(
 )
 """What a calibration is taken for where its response states nothing else; see `fit_response`.
 
-An uncooled camera in a laboratory is accurate to 0.5 K [1]; corrected for its own temperature, it
-leaves 0.2 K over time and pixels [2]: here 1 % of 20 K, and 0.1 K from pixel to pixel. An area
-blackbody is known to 0.1 K, and black within 1 to 3 % [3]. What is mirrored indoors emits alike in
-both bands within 2 %: skin 0.98, fabrics 0.80 to 0.97, of a person that moves a part.
-
-References
-----------
-.. [1] Kelly et al. (2019), Remote Sensing 11, 567, doi:10.3390/rs11050567
-.. [2] Nugent, Shaw, Pust (2013), Optical Engineering 52, 061304, doi:10.1117/1.OE.52.6.061304
-.. [3] Clausen (2007), International Journal of Thermophysics 28, 2145
+An uncooled camera in a laboratory is accurate to 0.5 K (Kelly et al. 2019, doi:10.3390/rs11050567);
+corrected for its own temperature, it leaves 0.2 K over time and pixels (Nugent, Shaw, Pust 2013,
+doi:10.1117/1.OE.52.6.061304): here 1 % of 20 K, and 0.1 K from pixel to pixel. An area blackbody is
+known to 0.1 K, and black within 1 to 3 % (Clausen 2007, International Journal of Thermophysics 28,
+2145). What is mirrored indoors emits alike in both bands within 2 %: skin 0.98, fabrics 0.80 to
+0.97, of a person that moves a part.
 """
 
 EXACT: Final[Mapping[str, float]] = MappingProxyType(
@@ -79,6 +75,9 @@ class Curve:
 
     .. math:: U(T) = \frac{C}{\exp(c_2 / (A T + B)) - 1} + O
 
+    (1982, in Temperature: its Measurement and Control in Science and Industry 5, 421-427; Saunders,
+    White 2003, doi:10.1088/0026-1394/40/4/309).
+
     Attributes
     ----------
     band : str
@@ -87,12 +86,6 @@ class Curve:
         C [count], A (effective wavelength) [m], B [m K] and O [count].
     reference, lowest, highest : float
         Reference temperature :math:`T_r`, and calibrated range [K].
-
-    References
-    ----------
-    .. [1] Sakuma, Hattori (1982), in Temperature: its Measurement and Control in Science and
-       Industry 5, 421-427
-    .. [2] Saunders, White (2003), Metrologia 40, 195, doi:10.1088/0026-1394/40/4/309
     """
 
     band: str
@@ -210,7 +203,7 @@ def accuracy(
     limits = {"blackbody_emissivity": (1e-3, 1.0), "room_temperature": _numbers.KELVIN}
     limits |= {"gain_std": (0.0, 1.0), "background_ratio_std": (0.0, 1.0)}  # relative, not in %
     for name, default in ACCURACY.items():
-        value = np.asarray(response[name].values if name in response else default, np.float64)
+        value = np.asarray(response.get(name, default), np.float64)
         stated[name], within = value, limits.get(name, (0.0, schema.LARGEST))
         if not np.all((value >= within[0]) & (value <= within[1])):
             _numbers.real_numbers(f"{name} of the response", value, within)  # says which and why

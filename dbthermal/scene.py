@@ -12,7 +12,7 @@ from typing import Any, Final, Literal
 
 import xarray as xr
 
-from dbthermal import _rows, _text, schema, store
+from dbthermal import _arrays, _text, schema, store
 from dbthermal import response as responses
 from dbthermal._arrays import made_on_disk, on_disk
 from dbthermal.alignment import _joint, align, register
@@ -120,7 +120,7 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
             result = separate_capture(
                 capture, correction, response, registration=registration, **options
             )
-            slabs = _rows.slabs(result, _rows.blocks(result["object_temperature"].shape))
+            slabs = _arrays.slabs(result, _arrays.blocks(result["object_temperature"].shape))
             store.save_rows(slabs, target, provenance or store.provenance({}))
         return store.open_dataset(target)
     # Correct each camera, register the views, and synchronise the bands.

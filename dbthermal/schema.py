@@ -4,12 +4,13 @@ A name is agreed here first, then used. `check` holds a dataset against its stag
 the value that offends.
 """
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntFlag
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, Final, Self
+from typing import Any, Final, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -37,6 +38,11 @@ __all__ = [
     "has_flag",
 ]
 __dir__ = __all__.copy
+
+Laid = TypeVar("Laid", xr.DataArray, xr.Dataset)
+
+_STEP: Final = 1e-4  # share of the smallest step that a rounded coordinate may be off
+_ROUNDING: Final = 4.0  # units in the last place of the largest value, likewise
 
 
 @dataclass(frozen=True)
@@ -450,7 +456,11 @@ def check_variable(array: xr.DataArray, variable: Variable, label: str) -> None:
         if dim == "band":
             band_positions(array, [], label)
         elif dim in COORDINATES:
-            _check_coordinate(array, str(dim), label)
+            if dim not in array.coords:
+                raise ValueError(f"Missing coordinate '{dim}' of {label}. Must be given.")
+            units, name = COORDINATES[str(dim)].units, f"'{dim}' of {label}"
+            values = check_numbers(array[dim], name, units).values.astype(np.float64)
+            require_rising(values, name, units)
 
 
 def check_numbers(array: xr.DataArray, label: str, units: str | None = None) -> xr.DataArray:
@@ -502,35 +512,80 @@ def require(data: object, kinds: type | tuple[type, ...], label: str) -> None:
         raise TypeError(f"{message}. Must be a {' or a '.join(names)}.")
 
 
-def _check_coordinate(array: xr.DataArray, dim: str, label: str) -> None:
-    if dim not in array.coords:
-        raise ValueError(f"Missing coordinate '{dim}' of {label}. Must be given.")
-    units = COORDINATES[dim].units
-    values = check_numbers(array[dim], f"'{dim}' of {label}", units).values.astype(np.float64)
-    steps = np.diff(values)
+def require_rising(values: npt.NDArray[np.float64], label: str, units: str) -> None:
+    """Refuse values that are not finite, or do not increase strictly."""
     if not np.all(np.isfinite(values)):
-        raise ValueError(f"Invalid '{dim}' of {label}: not finite. Must be finite.")
-    if np.any(steps <= 0):
-        place = int(np.argmax(steps <= 0))
+        raise ValueError(f"Invalid {label}: not finite. Must be finite.")
+    if np.any(wrong := np.diff(values) <= 0):
+        place = int(np.argmax(wrong))
         pair = f"{values[place]} {units} is followed by {values[place + 1]} {units}"
-        raise ValueError(f"Unordered '{dim}' of {label}: {pair}. Must increase strictly.")
+        raise ValueError(f"Unordered {label}: {pair}. Must increase strictly.")
 
 
 def pixel_status(capture: xr.Dataset) -> npt.NDArray[np.uint32]:
     """Bits of `Status` of each pixel (y, x), 0 without a variable `status`."""
-    if "status" not in capture:
-        return np.zeros((capture.sizes["y"], capture.sizes["x"]), dtype=np.uint32)
-    return np.asarray(capture["status"].values, dtype=np.uint32)
+    good = np.zeros((capture.sizes["y"], capture.sizes["x"]))
+    return np.asarray(capture.get("status", good), dtype=np.uint32)
 
 
 def segments(capture: xr.Dataset) -> npt.NDArray[np.intp]:
     """Number of shutter events before each frame (time), 0 without a variable `segment`."""
-    if "segment" not in capture:
-        return np.zeros(capture.sizes["time"], dtype=np.intp)
-    return np.asarray(capture["segment"].values, dtype=np.intp)
+    without = np.zeros(capture.sizes["time"])
+    return np.asarray(capture.get("segment", without), dtype=np.intp)
 
 
 def noise_factor(capture: xr.Dataset) -> npt.NDArray[np.float64]:
     """Noise (band) [1] over that before an alignment, 1 without a variable `noise_factor`."""
-    whole = xr.DataArray(np.ones(capture.sizes["band"]), dims="band")
-    return np.asarray(capture.get("noise_factor", whole).values, dtype=np.float64)
+    whole = np.ones(capture.sizes["band"])
+    return np.asarray(capture.get("noise_factor", whole), dtype=np.float64)
+
+
+def laid_on(
+    array: Laid,
+    reference: xr.DataArray | xr.Dataset,
+    label: str,
+    of: str,
+    dims: Sequence[str] = ("band", "time", "temperature", "material", "y", "x"),
+) -> Laid:
+    """Array with the bands, order and coordinates of a reference; a ValueError names the two."""
+    require(array, (xr.DataArray, xr.Dataset), label)
+    # Bands by name, then every common dim.
+    shared = [dim for dim in dims if dim in array.dims and dim in reference.dims]
+    if "band" in shared and "band" in array.coords and "band" in reference.coords:
+        names = [str(name) for name in reference["band"].values]
+        array = array.isel(band=band_positions(array, names, label))
+    for dim in shared:
+        if array.sizes[dim] != reference.sizes[dim]:
+            rule = f"Must be that of {of}, {reference.sizes[dim]}"
+            raise ValueError(f"Invalid size {array.sizes[dim]} of '{dim}' of {label}. {rule}.")
+        if dim in array.coords and dim in reference.coords:
+            _require_same(array[dim].values, reference[dim].values, f"'{dim}' of {label}", of)
+    places = {dim: reference[dim].variable for dim in shared if dim in reference.coords}
+    return array.assign_coords(places)
+
+
+def _require_same(
+    values: npt.NDArray[Any], reference: npt.NDArray[Any], label: str, of: str
+) -> None:
+    """ValueError where two coordinates differ: numbers beyond rounding, all else as text."""
+    if {values.dtype.kind, reference.dtype.kind} <= set("iuf"):
+        actual, wanted = values.astype(np.float64), reference.astype(np.float64)
+        floats = [np.finfo(it.dtype).eps for it in (values, reference) if it.dtype.kind == "f"]
+        tolerance = _ROUNDING * max(floats, default=0.0) * np.abs(wanted).max(initial=0.0)
+        if wanted.size > 1:
+            tolerance += _STEP * np.abs(np.diff(wanted)).min()
+        equal = np.abs(actual - wanted) <= tolerance
+    else:
+        equal = values.astype(str) == reference.astype(str)
+    if not equal.all():
+        first = int(np.argmin(equal))
+        label = f"Invalid {label}: {values[first]} at position {first}, where that of {of} is"
+        raise ValueError(f"{label} {reference[first]}. Must be the same.")
+
+
+def warned(dataset: xr.Dataset, *sentences: str) -> xr.Dataset:
+    """Dataset with sentences in its attribute ``warnings``; each is a UserWarning, too."""
+    for sentence in dict.fromkeys(sentences):
+        warnings.warn(sentence, stacklevel=3)
+    notes = dict.fromkeys([*dataset.attrs.get("warnings", []), *sentences])
+    return dataset.assign_attrs(warnings=[*notes]) if notes else dataset

@@ -29,9 +29,8 @@ from dbthermal import (
     store,
 )
 from dbthermal import emissivity as emissivities
-from dbthermal._coordinates import laid_on
 from dbthermal.scene import separate_capture
-from dbthermal.schema import Status
+from dbthermal.schema import Status, laid_on
 from reproduction import figures as drawings
 from reproduction.experiments.twins import reflected_change
 from reproduction.filters import rank_filters
@@ -172,7 +171,7 @@ CASES: list[tuple[Call, str]] = [
     (lambda: mixing.matrix([86.0, 72.0]), "emissivity 86.0"),
     (lambda: mixing.condition_number(0.9), "two bands"),
     (lambda: noise.estimate(ONE.astype(complex), ONE, TIME), "signal"),
-    (lambda: noise.second_difference(ONE[:4], [0.0, 1.0, 1.0, 2.0]), "Must rise"),
+    (lambda: noise.second_difference(ONE[:4], [0.0, 1.0, 1.0, 2.0]), "Must increase strictly"),
     (lambda: alignment.align(CAPTURE, offset=0.0, reflection_shift=cast(Any, 3)), "shift"),
     (lambda: alignment.align(RAW, offset=0.0), "correct_capture, of a camera that corrects itself"),
     (lambda: correction.correct_capture(RAW, CORRECTION, shutter=NOTHING), "shutter"),

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from dbthermal import _arrays, _rows, alignment, correction, simulation
+from dbthermal import _arrays, alignment, correction, simulation
 from dbthermal.correction import _pixels
 from reproduction import disturbances
 
@@ -32,14 +32,14 @@ WHOLE = xr.DataArray(
 )
 def test_rows_are_read_as_an_array(monkeypatch: pytest.MonkeyPatch, place: dict[str, Any]) -> None:
     """Every way of indexing gives what the array has there, and computes only rows around it."""
-    monkeypatch.setattr(_rows, "_BLOCK", 150)
+    monkeypatch.setattr(_arrays, "_BLOCK", 150)
     computed: list[slice] = []
 
     def compute(rows: slice) -> np.ndarray:
         computed.append(rows)
         return WHOLE.values[:, :, rows]
 
-    array = _rows.lazy(compute, WHOLE)
+    array = _arrays.lazy(compute, WHOLE)
     part = array.isel(place)
     assert not computed
     np.testing.assert_array_equal(part.values, WHOLE.isel(place).values)
@@ -83,7 +83,7 @@ def test_a_capture_corrected_and_aligned_by_rows(monkeypatch: pytest.MonkeyPatch
         return corrected, aligned
 
     at_once = process(lazy=False)
-    monkeypatch.setattr(_rows, "_BLOCK", 40000)
+    monkeypatch.setattr(_arrays, "_BLOCK", 40000)
     monkeypatch.setattr(_pixels, "_BLOCK", 150 * 5)  # five pixels of a row
     for whole, by_rows in zip(at_once, process(lazy=True), strict=True):
         # The level's root mean square is that of other samples.
@@ -100,7 +100,7 @@ def test_rows_without_a_good_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
     raw, fitted = recorded(60, 3)
     raw["counts"].values[:, :, :8] = 0
     whole = correction.correct_capture(raw, fitted)["pattern_std"].values
-    monkeypatch.setattr(_rows, "_BLOCK", 2 * 60 * 28 * 4)  # four rows
+    monkeypatch.setattr(_arrays, "_BLOCK", 2 * 60 * 28 * 4)  # four rows
     by_rows = correction.correct_capture(raw, fitted, lazy=True)["pattern_std"].values
     assert np.all(whole > 0)
     np.testing.assert_allclose(by_rows, whole, rtol=0.02)

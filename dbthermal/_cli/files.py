@@ -13,13 +13,13 @@ from typing import Any, Final
 import numpy as np
 import xarray as xr
 
-from dbthermal import _rows, readers, schema, store
+from dbthermal import _arrays, readers, schema, store
 from dbthermal._arrays import on_disk
 from dbthermal._cli import PLUS, accepted, is_source, leaves
-from dbthermal._warnings import warned
 from dbthermal.explorer._answer import answer
 from dbthermal.readers import _formats as formats
 from dbthermal.response import ACCURACY
+from dbthermal.schema import warned
 from dbthermal.store import _integrity as integrity
 
 _MADE_BY = {
@@ -225,8 +225,8 @@ def saved(result: xr.Dataset, options: Namespace, path: Path | None = None) -> d
     """Save a result with its provenance, a capture by rows, which may be lazy, and describe it."""
     path, blocks = path or options.output, [slice(None)]
     if "counts" in result and result["counts"].ndim == 4:
-        blocks = [*_rows.blocks(result["counts"].shape)]
-    store.save_rows(_rows.slabs(result, blocks), path, provenance(options))
+        blocks = [*_arrays.blocks(result["counts"].shape)]
+    store.save_rows(_arrays.slabs(result, blocks), path, provenance(options))
     return {str(path): summary(store.open_dataset(path))}
 
 

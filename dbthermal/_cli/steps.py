@@ -28,10 +28,10 @@ from dbthermal import (
 )
 from dbthermal._cli import PLUS, accepted, files, leaves
 from dbthermal._text import check_listed, repeated
-from dbthermal._warnings import warned
-from dbthermal.limits._planner import SKY_LEVEL
+from dbthermal.limits import SKY_LEVEL
 from dbthermal.readers._recording import optional
 from dbthermal.response import ACCURACY
+from dbthermal.schema import warned
 from dbthermal.separation._doubts import hardly_measured
 from dbthermal.separation._quality import MOST_MISSING
 from dbthermal.separation._run import BASE

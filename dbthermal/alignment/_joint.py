@@ -16,13 +16,12 @@ from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from dbthermal import schema
 from dbthermal._arrays import Mask, empty, quotient, release
-from dbthermal._warnings import warned
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment._offset import SEARCH, check, measured_offset
 from dbthermal.alignment._planes import Scale
 from dbthermal.alignment._reflections import seen_apart, shift_of
 from dbthermal.alignment._resampling import STEP, on_one_clock
-from dbthermal.schema import Status
+from dbthermal.schema import Status, warned
 
 _PIXELS, _FRAMES = 20_000, 400  # of the capture of means that gives clocks and shift, at most
 _COMMON: Final = 0.5  # share of a square's pixels that a frame must have

@@ -8,12 +8,12 @@ import numpy.typing as npt
 import xarray as xr
 from scipy.sparse import csr_array, diags_array, eye_array
 
-from dbthermal import _numbers, _rows, schema
+from dbthermal import _arrays, _numbers, schema
 from dbthermal._arrays import Array, Mask
-from dbthermal._coordinates import laid_on
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment import _offset as lags
 from dbthermal.alignment._splines import Movie
+from dbthermal.schema import laid_on
 
 TRANSFORM: Final = schema.Variable(
     ("band", "row", "column"), "float64", "1", "pixel of the first view to pixel of this one"
@@ -60,7 +60,7 @@ def moved(corrected: xr.Dataset, maps: Sequence[Array], *, lazy: bool) -> tuple[
         pairs = zip(counts, weights, strict=True)
         return np.stack([_warped(view, matrix, rows) for view, matrix in pairs])
 
-    warped = _rows.lazy(views, counts) if lazy else counts.copy(data=views(slice(None)))
+    warped = _arrays.lazy(views, counts) if lazy else counts.copy(data=views(slice(None)))
     result = corrected.assign(counts=warped)
     if status is not None:
         result = result.assign(status=status.copy(data=_warped_status(flags, weights)))
@@ -215,7 +215,7 @@ def on_one_clock(
     plans, thin = [], -(-signals[0].size // lags.TELLING)
     factors, rapid = np.ones((2, len(names)))
     # Frames that are NaN, or a copy of the frame before, in every block of rows.
-    blocks = (counts.isel(y=rows).values for rows in _rows.blocks(counts.shape))
+    blocks = (counts.isel(y=rows).values for rows in _arrays.blocks(counts.shape))
     copies = [[clocks.missing(single(film)) for film in block] for block in blocks]
     missing = np.all(copies, axis=0)
     for band, (row, absent) in enumerate(zip(stamps, missing, strict=True)):
@@ -242,7 +242,7 @@ def on_one_clock(
     if not np.all([plan.valid for plan in plans], axis=0).any():
         label = f"Invalid offset {offsets.tolist()} s: it leaves no frame that all bands have"
         raise ValueError(f"{label}. Must be in seconds, and the recordings overlap.")
-    movie = _rows.lazy(aligned, counts) if lazy else counts.copy(data=aligned(slice(None)))
+    movie = _arrays.lazy(aligned, counts) if lazy else counts.copy(data=aligned(slice(None)))
     result = _assembled(corrected, movie, times)
     factors *= schema.noise_factor(corrected)
     result = result.assign(noise_factor=("band", factors, schema.NOISE_FACTOR.attrs))

@@ -128,33 +128,22 @@ NO_BIAS: Final = Bias()
 """Readings whose errors are independent."""
 
 
-class _Signal(NamedTuple):
-    """Blackbody signal (n) [count]; its independent errors (n), and common ones (term, n)."""
-
-    values: Array
-    std: Array
-    bias: Array
-
-    @property
-    def covariance(self) -> Array:
-        """Covariance (n, n) of the signal [count^2]."""
-        return np.asarray(np.diag(self.std**2) + self.bias.T @ self.bias)
-
-
 class _Signals(NamedTuple):
-    """Counts I (n) of a band and their noise [count], and the signals W_o and W_b."""
+    """Counts I (n) of a band, their noise, W_o and W_b (n) [count], and covariances (n, n)."""
 
     counts: Array
     noise: float
-    emitted: _Signal
-    reflected: _Signal
+    emitted: Array
+    emitted_covariance: Array
+    reflected: Array
+    reflected_covariance: Array
 
     def weighted(self, emissivity: float, values: Array) -> Array:
         """Inverse covariance of the residual y - e x, times values (n)."""
         # s_I^2 + e^2 cov(W_o) + (1 - e)^2 cov(W_b)
         covariance = self.noise**2 * np.eye(values.size)
-        covariance += emissivity**2 * self.emitted.covariance
-        covariance += (1.0 - emissivity) ** 2 * self.reflected.covariance
+        covariance += emissivity**2 * self.emitted_covariance
+        covariance += (1.0 - emissivity) ** 2 * self.reflected_covariance
         return np.asarray(np.linalg.solve(covariance, values))
 
 
@@ -164,14 +153,16 @@ def fit_emissivity(
     r"""Emissivity of a material per band, by contact thermometry and a reflected blackbody.
 
     Each measurement i has counts :math:`I_i`, the object's temperature by thermocouple and the
-    reflected blackbody's temperature (equation 10 of the paper [1]_, by least squares):
+    reflected blackbody's temperature (equation 10 of Narayanan, Ramanagopal, Narasimhan 2026,
+    doi:10.48550/arXiv.2509.11334, by least squares):
 
     .. math:: I_i - U(T_{b,i}) = e \, (U(T_{o,i}) - U(T_{b,i}))
 
     weighted by the covariance of both sides, iterated in e: the independent part :math:`s_i^2 =
     s_I^2 + (e U'(T_o) s_o)^2 + ((1-e) U'(T_b) s_b)^2`, and for each common error the outer product
-    of its effects [2]_. The differences on the right are weighted as the fit adjusts them [3]_,
-    because their scatter would pass for contrast.
+    of its effects (Aitken 1936, doi:10.1017/S0370164600014346). The differences on the right are
+    weighted as the fit adjusts them (York et al. 2004, doi:10.1119/1.1632486), because their
+    scatter would pass for contrast.
 
     Parameters
     ----------
@@ -188,21 +179,10 @@ def fit_emissivity(
     Dataset
         `emissivity`, `emissivity_std` (band) [1]; `reduced_chi2` (band) [1], near 1 if the
         uncertainties are realistic; `residual` (band, measurement) [count].
-
-    Raises
-    ------
-    TypeError, ValueError, ArithmeticError
-        If an input is not as described or not finite, there are fewer than two measurements, a
-        temperature lies outside the response, object and background differ by less than three
-        standard deviations, or a result lies outside `schema.EMISSIVITY_LIMITS` by more than three;
-        if the fit does not converge.
-
-    References
-    ----------
-    .. [1] Narayanan, Ramanagopal, Narasimhan (2026), doi:10.48550/arXiv.2509.11334
-    .. [2] Aitken (1936), Proceedings of the Royal Society of Edinburgh 55, 42,
-       doi:10.1017/S0370164600014346
-    .. [3] York et al. (2004), American Journal of Physics 72, 367, doi:10.1119/1.1632486
+        TypeError, ValueError or ArithmeticError if an input is not as described or not finite,
+        there are fewer than two measurements, a temperature lies outside the response, object and
+        background differ by less than three standard deviations, a result lies outside
+        `schema.EMISSIVITY_LIMITS` by more than three, or the fit does not converge.
 
     Examples
     --------
@@ -219,28 +199,29 @@ def fit_emissivity(
     >>> fit_emissivity(measured, camera, reading_std=(0.1, 0.05)).emissivity.values.round(3)
     array([0.85, 0.85])
     """
-    warm, stds = _readings(measured, "contact", reading_std, bias)
+    warm, stds, bands = _readings(measured, response, "contact", reading_std, bias)
     if measured.sizes["measurement"] < 2:
         raise ValueError("Invalid number of measurements 1. Must be at least 2.")
     cold = measured["background_temperature"].values.astype(np.float64)
     _require_contrast(warm - cold, stds, "background")
     signals = {}
-    for curve, noise, counts in _bands(measured, response, warm):
+    for curve, noise, counts in bands:
         require_range(cold, curve, "background temperature")
-        emitted = _Signal(curve.counts(warm), *bias.emitted(curve, warm, float(stds[0])))
-        errors = bias.reflected(curve, cold, float(stds[1]))
-        reflected = _Signal(bias.reflection(curve, cold), *errors)
-        signals[curve.band] = _Signals(counts, noise, emitted, reflected)
+        reflected = _covariance(*bias.reflected(curve, cold, float(stds[1])))
+        emitted = curve.counts(warm), _covariance(*bias.emitted(curve, warm, float(stds[0])))
+        signals[curve.band] = _Signals(
+            counts, noise, *emitted, bias.reflection(curve, cold), reflected
+        )
     return _fit(signals)
 
 
 def reflector_emissivity(
     measured: xr.Dataset, response: xr.Dataset, reading_std: Pair, bias: Bias = NO_BIAS
 ) -> xr.Dataset:
-    r"""Emissivity of a material per band by the reflector method of the standards.
+    r"""Emissivity of a material per band by the reflector method of ISO 18434-1, ASTM E1862, E1933.
 
     A crumpled foil in the object's place gives the reflected signal :math:`W_r`, a contact
-    thermometer the object's own :math:`W_o = U(T_o)`, and the camera the object's W [1]_ [2]_:
+    thermometer the object's own :math:`W_o = U(T_o)`, and the camera the object's W:
 
     .. math:: e = \frac{W - W_r}{W_o - W_r}, \qquad
               s_e = \frac{\sqrt{s_W^2 + e^2 s_{W_o}^2 + (1 - e)^2 s_{W_r}^2}}{|W_o - W_r|}
@@ -265,11 +246,6 @@ def reflector_emissivity(
         As `fit_emissivity`, and its errors, but one measurement is enough: the reduced chi-square
         is then NaN.
 
-    References
-    ----------
-    .. [1] ISO 18434-1:2008, Condition monitoring and diagnostics of machines, Thermography
-    .. [2] ASTM E1862, reflected temperature; ASTM E1933, emissivity
-
     Examples
     --------
     One reading of an object at 50 degrees Celsius in a room at 22, of emissivity 0.3.
@@ -285,39 +261,38 @@ def reflector_emissivity(
     >>> reflector_emissivity(measured, camera, reading_std=(0.2, 0.3)).emissivity.values.round(3)
     array([0.3, 0.3])
     """
-    warm, stds = _readings(measured, "reflector", reading_std, bias)
+    warm, stds, bands = _readings(measured, response, "reflector", reading_std, bias)
     signals = {}
     foils = measured["reflected_counts"].values.astype(np.float64)
-    for (curve, noise, counts), foil in zip(_bands(measured, response, warm), foils, strict=True):
+    for (curve, noise, counts), foil in zip(bands, foils, strict=True):
         cold = curve.inverse(foil)
         _require_contrast(warm - cold, stds, f"reflection in band '{curve.band}'")
-        emitted = _Signal(curve.counts(warm), *bias.emitted(curve, warm, float(stds[0])))
-        std = np.hypot(noise, curve.count_slope(cold) * stds[1])
-        reflected = _Signal(foil, std, np.zeros((0, warm.size)))
-        signals[curve.band] = _Signals(counts, noise, emitted, reflected)
+        emitted = curve.counts(warm), _covariance(*bias.emitted(curve, warm, float(stds[0])))
+        reflected = foil, np.diag(np.hypot(noise, curve.count_slope(cold) * stds[1]) ** 2)
+        signals[curve.band] = _Signals(counts, noise, *emitted, *reflected)
     return _fit(signals)
 
 
 def _readings(
-    measured: xr.Dataset, stage: str, reading_std: Pair, bias: Bias
-) -> tuple[Array, Array]:
-    """Check the readings; corrected object temperature [K], and deviations of a reading [K]."""
+    measured: xr.Dataset, response: xr.Dataset, stage: str, reading_std: Pair, bias: Bias
+) -> tuple[Array, Array, list[tuple[Curve, float, Array]]]:
+    """Object temperature (n) and deviations of a reading [K]; curve, noise, counts (n) by band."""
     schema.check(measured, stage)
     for name, variable in measured.data_vars.items():
         schema.require_measured(variable.values, str(name))
     warm = bias.corrected(measured["object_temperature"].values.astype(np.float64))
-    return warm, _numbers.real_numbers("reading_std [K]", reading_std, _numbers.POSITIVE, (2,))
-
-
-def _bands(
-    measured: xr.Dataset, response: xr.Dataset, warm: Array
-) -> list[tuple[Curve, float, Array]]:
-    """Response, noise and counts (measurement) of each band."""
+    stds = _numbers.real_numbers("reading_std [K]", reading_std, _numbers.POSITIVE, (2,))
     names = [str(name) for name in measured["band"].values]
     noises, curves = responses.noise(response, names).tolist(), responses.curves(response, names)
     for curve in curves:
         require_range(warm, curve, "object temperature")
-    return list(zip(curves, noises, measured["counts"].values.astype(np.float64), strict=True))
+    counts = measured["counts"].values.astype(np.float64)
+    return warm, stds, list(zip(curves, noises, counts, strict=True))
+
+
+def _covariance(std: Array, bias: Array) -> Array:
+    """Covariance (n, n) of a signal, by independent errors (n) and common ones (term, n)."""
+    return np.asarray(np.diag(std**2) + bias.T @ bias)
 
 
 def _require_contrast(difference: Array, stds: Array, partner: str) -> None:
@@ -343,15 +318,15 @@ def _fit(signals: dict[str, _Signals]) -> xr.Dataset:
 def _fit_band(signals: _Signals, name: str) -> tuple[float, float, float, Array]:
     """Emissivity, its standard deviation, reduced chi-square and residuals of one band."""
     # Line through the origin, of I - W_b over W_o - W_b [count].
-    x = signals.emitted.values - signals.reflected.values
-    y = signals.counts - signals.reflected.values
+    x = signals.emitted - signals.reflected
+    y = signals.counts - signals.reflected
     emissivity = float(x @ y / (x @ x))
     for _ in range(_ITERATIONS):
         # York et al. (2004): weigh by the abscissa as the fit adjusts it, without its scatter,
         # x - cov(x, r) cov(r)^-1 r with cov(x, r) = -e cov(W_o) + (1 - e) cov(W_b).
         weighted = signals.weighted(emissivity, y - emissivity * x)
-        adjusted = x + emissivity * signals.emitted.covariance @ weighted
-        adjusted = adjusted - (1.0 - emissivity) * signals.reflected.covariance @ weighted
+        adjusted = x + emissivity * signals.emitted_covariance @ weighted
+        adjusted = adjusted - (1.0 - emissivity) * signals.reflected_covariance @ weighted
         weights = signals.weighted(emissivity, adjusted)
         previous, emissivity = emissivity, float((weights @ y) / (weights @ x))
         if abs(emissivity - previous) < _CONVERGED:

@@ -13,7 +13,6 @@ from scipy.special import chdtri
 from dbthermal import _numbers, bands, planck, schema
 from dbthermal import response as responses
 from dbthermal._arrays import Array
-from dbthermal._warnings import warned
 from dbthermal.response import ACCURACY, Curve
 
 AMBIENT: Final = 298.15
@@ -58,9 +57,9 @@ def fit_response(  # noqa: PLR0913 - what is known of blackbody and cameras, by 
 
     .. math:: U(T) = \frac{C}{\exp(c_2 / (A T + B)) - 1} + O, \qquad U(T) \approx a T + b
 
-    the Sakuma-Hattori curve [1]_ and the least-squares line. C and O enter linearly and are
-    eliminated [2]_; A and B are found by nonlinear least squares, with the mean wavelength
-    A + B / T within the band.
+    the Sakuma-Hattori curve (see `response.Curve`) and the least-squares line. C and O enter
+    linearly and are eliminated (Golub, Pereyra 2003, doi:10.1088/0266-5611/19/2/201); A and B are
+    found by nonlinear least squares, with the mean wavelength A + B / T within the band.
 
     Counts are refused whose n residuals r are larger than noise s, rounding and the error of the
     blackbody explain, of good counts once in 1e4 sweeps:
@@ -99,25 +98,11 @@ def fit_response(  # noqa: PLR0913 - what is known of blackbody and cameras, by 
         `netd` (band) [K]. `offset_std`, `gain_std`, `pattern_std` (band), `blackbody_accuracy`,
         `blackbody_emissivity`, `room_temperature` and `background_ratio_std` as stated. Attribute
         ``blackbody``, the temperatures and their deviations in words, which results repeat.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If an input is not as described, a value is NaN, or the counts follow no Planck curve, as of
-        a camera that saturates, changes its range, or gives counts linear in temperature; the error
-        names the temperature.
-
-    Warns
-    -----
-    UserWarning
-        If the NETD of a band of `bands.FILTERS` is less than half that of one that contains it:
-        then their names or files may be exchanged.
-
-    References
-    ----------
-    .. [1] Sakuma, Hattori (1982), in Temperature: its Measurement and Control in Science and
-       Industry 5, 421-427
-    .. [2] Golub, Pereyra (2003), Inverse Problems 19, R1, doi:10.1088/0266-5611/19/2/201
+        TypeError or ValueError if an input is not as described, a value is NaN, or the counts
+        follow no Planck curve, as of a camera that saturates, changes its range, or gives counts
+        linear in temperature; the error names the temperature. UserWarning if the NETD of a band of
+        `bands.FILTERS` is less than half that of one that contains it: then their names or files
+        may be exchanged.
 
     Examples
     --------
@@ -189,7 +174,7 @@ def fit_response(  # noqa: PLR0913 - what is known of blackbody and cameras, by 
     # Noise in kelvin at the reference temperature.
     netd = noises / np.array([curve.reference_slope for curve in curves])
     result = result.assign(schema.variables("response", {"noise": noises, "netd": netd}))
-    return warned(result, *_exchanged(dict(zip(names, netd, strict=True))))
+    return schema.warned(result, *_exchanged(dict(zip(names, netd, strict=True))))
 
 
 def _exchanged(netd: Mapping[str, float]) -> list[str]:
@@ -211,8 +196,9 @@ def maker_response(files: Mapping[str, Mapping[str, Any]]) -> xr.Dataset:
 
     .. math:: I(T) = \frac{R_1}{R_2 (\exp(B / T) - F)} - O
 
-    is, for F = 1, the Sakuma-Hattori curve with :math:`C = R_1 / R_2`, :math:`A = c_2 / B` and no
-    shift; for another F the curve is fitted over the camera's range, with an error that is stated.
+    (Tattersall 2017, Thermimage, doi:10.5281/zenodo.1069704) is, for F = 1, the Sakuma-Hattori
+    curve with :math:`C = R_1 / R_2`, :math:`A = c_2 / B` and no shift; for another F the curve is
+    fitted over the camera's range, with an error that is stated.
 
     These constants have no error bars, and what a filter in front of the lens takes away is not in
     them; results say so in ``calibration``. The maker states 2 K or 2 % as a rule: the bars of a
@@ -231,16 +217,8 @@ def maker_response(files: Mapping[str, Mapping[str, Any]]) -> xr.Dataset:
         Stage `response` of `schema`, without `noise`, over the range of temperatures that the
         cameras share. Attributes ``calibration`` ("maker's constants, without error bars") and
         ``form_error`` [K], the largest error of the form.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the files, or those of a band, are no mapping; a constant is missing or not positive, the
-        ranges do not overlap, or the form does not fit.
-
-    References
-    ----------
-    .. [1] Tattersall (2017), Thermimage, doi:10.5281/zenodo.1069704, for the maker's formula
+        TypeError or ValueError if the files, or those of a band, are no mapping; a constant is
+        missing or not positive, the ranges do not overlap, or the form does not fit.
 
     Examples
     --------
@@ -253,11 +231,9 @@ def maker_response(files: Mapping[str, Mapping[str, Any]]) -> xr.Dataset:
     """
     if not files:
         raise ValueError("Empty mapping of files. Must have the attributes of one band at least.")
-    listing: Any = files
-    for entry in (listing, *(listing.values() if isinstance(listing, Mapping) else ())):
-        if not isinstance(entry, Mapping):
-            rule = "Must be a mapping: attributes by band"
-            raise TypeError(f"Invalid files of type {type(entry).__name__}. {rule}.")
+    schema.require(files, Mapping, "files by band")
+    for attrs in files.values():
+        schema.require(attrs, Mapping, "files of a band")
     ranges = [
         [_constant(attrs, f"range_{end}", band) for end in ("min", "max")]
         for band, attrs in files.items()
@@ -409,9 +385,5 @@ def _constant(attrs: Any, key: str, band: str, *, positive: bool = True) -> floa
     if f"file_{key}" not in attrs:
         rule = "Must be in the file, as in FLIR's: else fit a blackbody, by fit_response"
         raise ValueError(f"Missing {key} of band '{band}'. {rule}.")
-    value = float(attrs[f"file_{key}"])
-    if positive:
-        planck.require_positive(f"{key} of band '{band}'", value)
-    elif not np.isfinite(value):
-        raise ValueError(f"Invalid {key} of band '{band}' {value}. Must be finite.")
-    return value
+    limits = _numbers.POSITIVE if positive else _numbers.FINITE
+    return _numbers.real_number(f"{key} of band '{band}'", float(attrs[f"file_{key}"]), limits)

@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from dbthermal import _numbers, _rows, schema
+from dbthermal import _arrays, _numbers, schema
 from dbthermal._arrays import Mask
-from dbthermal._warnings import warned
 from dbthermal.correction._frames import sampling, unreported
 from dbthermal.correction._nonuniformity import (
     DETECTOR_MAXIMUM,
@@ -25,8 +24,16 @@ from dbthermal.correction._nonuniformity import (
     renew_offset,
 )
 from dbthermal.correction._pixels import mark_bad, mark_repeats
-from dbthermal.correction._shutter import distinct, events_of, find_shutter, mark_shutter
-from dbthermal.correction._temporal import Reference, refer, undo_drift, undo_lag
+from dbthermal.correction._temporal import (
+    Reference,
+    distinct,
+    events_of,
+    find_shutter,
+    mark_shutter,
+    refer,
+    undo_drift,
+    undo_lag,
+)
 
 __all__ = [
     "DETECTOR_MAXIMUM",
@@ -140,13 +147,8 @@ def correct_capture(  # noqa: PLR0913 - the options of each step, by name
         (band) [count]. Attributes: those of the steps; ``shutter_events`` (renewals of the
         offsets), ``frames_taken_out`` (by band, by `mark_shutter`), ``bad_frames`` (by band, which
         show no scene), and ``shutter_closed_frames`` (by band, recorded as closed; -1 without
-        `frame_flags`).
-
-    Warns
-    -----
-    UserWarning
-        Of bad frames, which it names, of frames that a stream repeats, and of a pattern that
-        changes or is not corrected.
+        `frame_flags`). UserWarning of bad frames, which it names, of frames that a stream repeats,
+        and of a pattern that changes or is not corrected.
 
     Examples
     --------
@@ -199,12 +201,12 @@ def correct_capture(  # noqa: PLR0913 - the options of each step, by name
     if "exposure_time" not in capture:
         result = result.drop_vars("exposure_time", errors="ignore")
     number = -1 if closed is None else closed.sum("time").values.tolist()
-    return warned(result.assign_attrs(shutter_closed_frames=number), *notes)
+    return schema.warned(result.assign_attrs(shutter_closed_frames=number), *notes)
 
 
 def _by_rows(measured: Callable[..., xr.Dataset], raw: xr.DataArray) -> xr.Dataset:
     """Correct block by block of rows, with counts that are computed when they are read."""
-    blocks = [measured(rows).drop_vars("counts") for rows in _rows.blocks(raw.shape)]
+    blocks = [measured(rows).drop_vars("counts") for rows in _arrays.blocks(raw.shape)]
     rule: Any = {"data_vars": "minimal", "coords": "minimal", "compat": "override"}
     whole = xr.concat(blocks, "y", combine_attrs="override", **rule)
     if "pattern_std" in whole:
@@ -213,7 +215,7 @@ def _by_rows(measured: Callable[..., xr.Dataset], raw: xr.DataArray) -> xr.Datas
         if len(finite):
             whole["pattern_std"].values[:] = np.sqrt(np.mean(finite, axis=0))
     like = raw.assign_attrs(schema.STAGES["corrected"]["counts"].attrs)
-    counts = _rows.by_pixels(lambda *window: measured(*window)["counts"].values, like)
+    counts = _arrays.by_pixels(lambda *window: measured(*window)["counts"].values, like)
     dead = sum(block.attrs["dead_pixels"] for block in blocks)
     return whole.assign(counts=counts).assign_attrs(dead_pixels=dead)
 

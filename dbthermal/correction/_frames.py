@@ -16,7 +16,7 @@ import xarray as xr
 from dbthermal import _samples, schema
 from dbthermal._arrays import Array, Mask, stride
 from dbthermal.correction._nonuniformity import OUTLIER
-from dbthermal.correction._shutter import FEWEST_COPIES
+from dbthermal.correction._temporal import FEWEST_COPIES
 from dbthermal.noise import MAD, MINIMUM_FRAMES
 
 Film = npt.NDArray[np.float32]
@@ -97,15 +97,13 @@ def sampling(counts: xr.DataArray) -> dict[str, slice]:
 def unreported(corrected: xr.Dataset, valid: Mask, renewals: Mask) -> Findings:
     """Find bad frames and steps of the pattern among the `valid` frames (band, time) of some rows.
 
-    A run of at most 5 s is bad if its image deviates by 6 standard deviations of a difference, in
-    half of the pixels or in whole rows, from the frames before and after, which are alike; suddenly
-    so; and if it shows no scene, or no other band deviates alike. Of two gains, by which noise and
-    contrast, or the pattern, change at once in one band, the rarer is bad. A pattern steps if the
-    means of 25 frames before and after differ from pixel to pixel by 2.5 times the variance of
-    noise and usual motion, at once, for longer, and in one band. `renewals` (band, time) are first
-    frames after events that are marked already.
-
-    Of 4e5 good frames of 48 kinds of scenes at 2 to 50 Hz less than 2e-4 are taken for bad ones.
+    A short run is bad if its image deviates, in half of the pixels or in whole rows, from the
+    frames before and after, which are alike; suddenly so; and if it shows no scene, or no other
+    band deviates alike. Of two gains, by which noise and contrast, or the pattern, change at once
+    in one band, the rarer is bad. A pattern steps if the means before and after differ from pixel
+    to pixel, at once, for longer, and in one band. `renewals` (band, time) are first frames after
+    marked events. Of 4e5 good frames of 48 kinds of scenes at 2 to 50 Hz less than 2e-4 are taken
+    for bad ones.
     """
     counts = corrected["counts"]
     good = (schema.pixel_status(corrected) & np.uint32(schema.Status.DEAD_PIXEL)) == 0

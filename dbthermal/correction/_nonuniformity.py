@@ -12,7 +12,6 @@ from scipy.special import chdtri
 
 from dbthermal import _numbers, schema
 from dbthermal._arrays import Array, Mask, stride
-from dbthermal._coordinates import laid_on
 from dbthermal.noise import MAD
 from dbthermal.schema import Status
 
@@ -198,10 +197,9 @@ def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
     if flat.dims != ("band", "y", "x") or "band" not in flat.coords:
         rule = "Must be (band, y, x), bands by name"
         raise ValueError(f"Invalid dims {flat.dims} of the flat image. {rule}.")
-    flat = laid_on(flat, correction, "the flat image", "the correction")
+    flat = schema.laid_on(flat, correction, "the flat image", "the correction")
     good = ~correction["bad"].values
-    if not np.all(schema.measured(flat.values[good])):
-        raise ValueError("Invalid flat image: a good pixel is not finite. Must be finite.")
+    schema.require_measured(flat.values[good], "flat image, in a good pixel")
     gain, offset = correction["gain"].values, correction["offset"].values
     corrected = gain * flat.values.astype(np.float64) + offset
     # Offsets that bring every good pixel to the mean.
@@ -247,7 +245,7 @@ def correct(
     if (counts.dtype.kind, counts.dtype.itemsize) != ("u", 2):  # of either byte order
         raise TypeError(f"Invalid dtype {counts.dtype} of the capture's counts. Must be uint16.")
     _numbers.whole_number("maximum of the detector", maximum, (1, DETECTOR_MAXIMUM))
-    maps = laid_on(correction, counts, "the correction", "the capture")
+    maps = schema.laid_on(correction, counts, "the correction", "the capture")
     _require_usable(maps)
     corrected = np.empty(counts.shape, dtype=np.float32)
     saturated = np.zeros(counts.shape[2:], dtype=bool)

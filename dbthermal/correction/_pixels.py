@@ -10,9 +10,8 @@ import numpy.typing as npt
 import xarray as xr
 from scipy.ndimage import maximum_filter1d, median_filter
 
-from dbthermal import _numbers, _rows, _samples, schema
+from dbthermal import _arrays, _numbers, _samples, schema
 from dbthermal._arrays import Array, Mask, quotient
-from dbthermal._warnings import warned
 from dbthermal.correction._nonuniformity import OUTLIER, outlying
 from dbthermal.noise import MAD, MINIMUM_FRAMES
 from dbthermal.schema import Status
@@ -52,11 +51,12 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     as a wire, cannot be told from a pixel that blinks, and is marked, too.
 
     Pattern. What the mean picture has beside planes and edges is the fixed pattern p of gains and
-    offsets (by the mask of [1]_); 0 where it is less than 0.7 of the same over two pixels, as of
-    detail behind a lens. More than 5 m in every segment give a UserWarning. A pattern that came
-    since the calibration is seen so, beyond `pattern_std` and the noise of the mean, in the segment
-    with the least. It is added to `pattern_std`, with a smooth part of 0.75 times its size, as of a
-    lens or housing that warmed: no image tells that from the scene, it is a prior.
+    offsets, by the mask of Immerkaer (1996, doi:10.1006/cviu.1996.0060); 0 where it is less than
+    0.7 of the same over two pixels, as of detail behind a lens. More than 5 m in every segment give
+    a UserWarning. A pattern that came since the calibration is seen so, beyond `pattern_std` and
+    the noise of the mean, in the segment with the least. It is added to `pattern_std`, with a
+    smooth part of 0.75 times its size, as of a lens or housing that warmed: no image tells that
+    from the scene, it is a prior.
 
     TypeError or ValueError if the threshold is not positive, or a band has fewer frames that are
     not NaN than 16, or than 0.4 s and three frames more, or no pixel with 16 samples.
@@ -76,11 +76,6 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
         `pattern_std` (band) [count]; and the attributes ``noisy_pixels`` and ``jumping_pixels``,
         their numbers, ``unjudged_pixels``, those with fewer than 16 samples that are not NaN in a
         band, which get no bit here, ``bad_threshold``, and ``fixed_pattern`` (band), p / m [1].
-
-    References
-    ----------
-    .. [1] Immerkaer (1996), Computer Vision and Image Understanding 64, 300,
-       doi:10.1006/cviu.1996.0060
 
     Examples
     --------
@@ -114,7 +109,7 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
         segments = np.unique(segment_numbers)
         # Noise and mean picture of each pixel, some at a time.
         level, still = np.empty(image), np.empty((segments.size, *image))
-        for window in _rows.windows(movie.shape, _BLOCK):
+        for window in _arrays.windows(movie.shape, _BLOCK):
             block = _measured(movie, *window)
             level[window] = _samples.noise(block)
             still[:, *window] = [_mean(block[segment_numbers == number]) for number in segments]
@@ -148,7 +143,7 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     marked = {"noisy_pixels": noisy, "jumping_pixels": jumping, "unjudged_pixels": unjudged}
     numbers = {name: int(mask.sum()) for name, mask in marked.items()}
     fixed = [round(pattern, 3) for pattern in patterns]
-    result = warned(result, *([_UNCORRECTED.format(", ".join(strong))] if strong else []))
+    result = schema.warned(result, *([_UNCORRECTED.format(", ".join(strong))] if strong else []))
     return result.assign_attrs(numbers, bad_threshold=threshold, fixed_pattern=fixed)
 
 
@@ -195,7 +190,7 @@ def _repeats(movie: xr.DataArray, frames: Mask) -> tuple[Mask, Mask]:
     middle = movie.isel(y=image[0] // 2, x=slice(None, None, step)).values
     grain = _samples.grain(middle, np.ones(middle.shape, dtype=bool))
     (clipped, frozen), ends = np.zeros((2, *image), dtype=bool), np.zeros((2, 3, *image))
-    for rows, columns in _rows.windows(movie.shape, _BLOCK):
+    for rows, columns in _arrays.windows(movie.shape, _BLOCK):
         counts = movie.isel(y=rows, x=columns).values.reshape(len(movie), -1)
         shape = (-1, columns.stop - columns.start)
         valid = np.broadcast_to(frames[:, np.newaxis], counts.shape)
@@ -218,7 +213,7 @@ def _repeats(movie: xr.DataArray, frames: Mask) -> tuple[Mask, Mask]:
 def _frames(movie: xr.DataArray, fewest: int) -> npt.NDArray[np.int64]:
     """Indices of the frames of a band that are not NaN."""
     finite = np.zeros(movie.sizes["time"], dtype=bool)
-    for rows, columns in _rows.windows(movie.shape, _BLOCK):
+    for rows, columns in _arrays.windows(movie.shape, _BLOCK):
         finite |= np.isfinite(movie.isel(y=rows, x=columns).values).any(axis=(1, 2))
     if finite.sum() < fewest:
         step = float(np.median(np.diff(movie["time"].values))) if finite.size > 1 else np.nan
@@ -239,7 +234,7 @@ def _measured(movie: xr.DataArray, rows: slice, columns: slice) -> Single:
 def _jumps(movie: xr.DataArray, limit: Array, stepped: Mask, reach: int) -> Mask:
     """Pixels (y, x) that change by more than their limit [count] while no neighbour does."""
     jumping = np.zeros(limit.shape, dtype=bool)
-    for rows, columns in _rows.windows(movie.shape, _BLOCK):
+    for rows, columns in _arrays.windows(movie.shape, _BLOCK):
         # A pixel at the edge of a block needs its neighbours in the next one.
         top, start = max(rows.start - 1, 0), max(columns.start - 1, 0)
         wide = slice(top, rows.stop + 1), slice(start, columns.stop + 1)

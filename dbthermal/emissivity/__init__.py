@@ -15,7 +15,6 @@ import xarray as xr
 
 from dbthermal import _numbers, _text, planck, schema
 from dbthermal._arrays import Array
-from dbthermal._coordinates import laid_on
 from dbthermal.bands import FILTERS, Band, get
 
 __all__ = [
@@ -48,6 +47,7 @@ _STEPS = 64  # of the integral of Planck's law, besides the steps of the spectru
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
 _TEMPERATURE = 300.0  # of the object, at which a noise is stated [K]
 _LIMIT = 5.0  # of a noise [K]; thermopile arrays have 1 K, and the quietest cameras 10 mK
+_MASK: Final = schema.Variable(("y", "x"), "bool", "1", "pixels of foil")
 _FOIL: Final = 0.01  # of its ratio: weathered, 0.947 to 0.956 in all bands of `embedded_table`
 
 
@@ -96,10 +96,7 @@ def band_table(
     [0.703, 0.625]
     """
     chosen = chosen_bands(bands)
-    if not isinstance(spectra, Mapping):
-        raise TypeError(
-            f"Invalid spectra of type {type(spectra).__name__}. Must map material to spectrum."
-        )
+    schema.require(spectra, Mapping, "spectra")
     if not spectra:
         raise ValueError("Empty spectra. Must hold at least one material.")
     if not 0 < _numbers.real_number("minimum_coverage", minimum_coverage) <= 1:
@@ -126,8 +123,10 @@ def band_table(
 def embedded_table() -> xr.Dataset:
     """Table of 25 common materials that comes with the package.
 
-    Rounded averages at 300 K over `bands.FILTERS`, made by `band_table` from three public libraries
-    [1]_ [2]_ [3]_, whose spectra are not redistributed.
+    Rounded averages at 300 K over `bands.FILTERS`, made by `band_table` from three public
+    libraries, whose spectra are not redistributed: Baldridge et al. (2009,
+    doi:10.1016/j.rse.2008.11.007), Meerdink et al. (2019, doi:10.1016/j.rse.2019.05.015) and
+    Kotthaus et al. (2014, doi:10.1016/j.isprsjprs.2014.05.005).
 
     Returns
     -------
@@ -135,12 +134,6 @@ def embedded_table() -> xr.Dataset:
         Stage `emissivity_table`: `emissivity` and `coverage` (material, band) [1]; some metals and
         tiles were measured up to 12.5 um only. Coordinates `library` and `source` (material) name
         the library, and the file or sample in it.
-
-    References
-    ----------
-    .. [1] Baldridge et al. (2009), doi:10.1016/j.rse.2008.11.007
-    .. [2] Meerdink et al. (2019), doi:10.1016/j.rse.2019.05.015
-    .. [3] Kotthaus et al. (2014), doi:10.1016/j.isprsjprs.2014.05.005
 
     Examples
     --------
@@ -222,9 +215,8 @@ def chosen_bands(bands: Bands) -> list[Band]:
     if isinstance(bands, (str, Band)):
         bands = [bands]
     listed = list(bands.values()) if isinstance(bands, Mapping) else list(bands)
-    odd = [band for band in listed if not isinstance(band, (str, Band))]
-    if odd:
-        raise TypeError(f"Invalid band {odd[0]!r}. Must be a Band, or the name of a filter.")
+    for band in listed:
+        schema.require(band, (str, Band), f"band {band!r:.60}")
     chosen = [get(band) if isinstance(band, str) else band for band in listed]
     names = [band.name for band in chosen]
     if not chosen or len(set(names)) < len(names):
@@ -399,10 +391,8 @@ def background_ratio(result: xr.Dataset, mask: xr.DataArray) -> xr.Dataset:
     """
     names = ("reflection_ratio", "reflection_ratio_std")
     schema.check(result, "separated", names, "the result")
-    dims, dtype = getattr(mask, "dims", None), getattr(mask, "dtype", None)
-    if dims != ("y", "x") or getattr(dtype, "kind", "") != "b":
-        raise TypeError("Invalid mask of foil. Must be a DataArray of dims ('y', 'x'), boolean.")
-    pixels = laid_on(mask, result, "the mask", "the result").values
+    schema.check_variable(mask, _MASK, "the mask of foil")
+    pixels = schema.laid_on(mask, result, "the mask", "the result").values
     ratio, std = (result[name].values[:, pixels].astype(np.float64) for name in names)
     seen = np.isfinite(ratio).all(axis=0) & np.isfinite(std).all(axis=0)
     if not seen.any():

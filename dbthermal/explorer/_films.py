@@ -14,10 +14,10 @@ import xarray as xr
 from scipy.constants import zero_Celsius
 from scipy.special import chdtri
 
-from dbthermal import _numbers, _rows, _text, schema, store
+from dbthermal import _arrays, _numbers, _text, schema, store
 from dbthermal import response as responses
 from dbthermal._arrays import Array, Mask, empty, on_disk, quotient, release
-from dbthermal._coordinates import laid_on
+from dbthermal.schema import laid_on
 
 Values = npt.NDArray[np.float32]
 Progress = Callable[[str, float], object]
@@ -71,7 +71,7 @@ class Pane:
         with on_disk(Path(gettempdir())):
             copy = empty(array.shape, array.dtype)
         height = array.encoding.get("preferred_chunks", {}).get("y", 1)
-        for block in _rows.blocks(array.shape, max(1, height * array.size // array.shape[1])):
+        for block in _arrays.blocks(array.shape, max(1, height * array.size // array.shape[1])):
             copy[:, block] = array.isel(y=block).values
             if progress is not None:
                 progress(f"reading {self.label}", block.stop / array.shape[1])

@@ -24,9 +24,9 @@ from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from scipy.constants import zero_Celsius
 
 from dbthermal import schema
-from dbthermal._coordinates import laid_on
 from dbthermal.figures import drawing
 from dbthermal.figures.drawing import band_label, canvas, draw_image, limits_of
+from dbthermal.schema import laid_on
 
 __all__ = [
     "REASONS",

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dbthermal import _text as texts
-from dbthermal.correction._shutter import FEWEST_COPIES
+from dbthermal.correction._temporal import FEWEST_COPIES
 from dbthermal.instruments.transport import Clock, Transport
 from dbthermal.schema import Flags
 

@@ -6,7 +6,7 @@ with n white noise of variance 1 and :math:`\Phi` a smooth subspace of time. All
 divided by the noise :math:`s_m`, so that the information is a sum of their products.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Final
 
@@ -141,7 +141,6 @@ def deviations(
     time: Array,
     order: Indices,
     reference: int,
-    *,
     emissivity_std: float = np.inf,
 ) -> dict[str, Array]:
     """Smallest deviations of `QUANTITIES`, (time, pixel) [K] or (band, pixel) [1]; or infinite."""
@@ -175,7 +174,7 @@ def _deviations(
     """Deviations of pixels of one order, for functions (time, order) and 1 / prior variance."""
     emissivity = sensitivity.emissivity
     bands, (frames, order) = len(emissivity), functions.shape
-    inverse = fisher_inverse(sensitivity, functions, prior)
+    variance = fisher_variance(sensitivity, functions, prior)
     # Gradients (pixel or 1, quantity, unknown): x(t) = Phi(t) c, d kappa_m = -d e_m / (1 - e_r)
     # + (1 - e_m) d e_r / (1 - e_r)^2.
     of_emissivity = np.eye(bands, bands + order + 1)[np.newaxis]
@@ -187,12 +186,12 @@ def _deviations(
     of_ratio[:, :, reference] += ((1.0 - emissivity) / (1.0 - emissivity[reference]) ** 2).T
     of_ratio[:, reference] = 0.0  # 1 by definition, not but for rounding
     variances = {
-        "object_temperature": inverse.variance(of_object),
-        "background_temperature": inverse.variance(of_background) + free_variance,
-        "emissivity": inverse.variance(of_emissivity),
-        "reflection_ratio": inverse.variance(of_ratio),
+        "object_temperature": variance(of_object),
+        "background_temperature": variance(of_background) + free_variance,
+        "emissivity": variance(of_emissivity),
+        "reflection_ratio": variance(of_ratio),
     }
-    return {name: np.sqrt(variance.T) for name, variance in variances.items()}
+    return {name: np.sqrt(values.T) for name, values in variances.items()}
 
 
 def _background(sensitivity: Sensitivity, functions: Array) -> tuple[Array, Array]:
@@ -210,26 +209,10 @@ def _background(sensitivity: Sensitivity, functions: Array) -> tuple[Array, Arra
     return np.swapaxes(gradient, 0, 1), (~sensitivity.resting / energy).T
 
 
-@dataclass(frozen=True)
-class FisherInverse:
-    """Inverse of Fisher informations, which may be singular, in factors."""
-
-    scale: Array  # deviation of each unknown, were it the only one (pixel, unknown)
-    directions: Array  # principal directions in units of `scale` (pixel, unknown, direction)
-    information: Array  # along them (pixel, direction) [1]
-
-    def variance(self, gradient: Array) -> Array:
-        """Smallest variance (pixel, quantity) for gradients; infinite without information."""
-        along = ((gradient * self.scale[:, np.newaxis]) @ self.directions) ** 2
-        blind = self.information <= _ROUNDING
-        dependent = along @ blind[..., np.newaxis] > _DEPENDENT * along.sum(axis=-1, keepdims=True)
-        # var(q) = h^T F^-1 h = sum_i (h . d_i)^2 / lambda_i
-        inverse = np.divide(1.0, self.information, out=np.zeros_like(blind, float), where=~blind)
-        return np.where(dependent, np.inf, along @ inverse[..., np.newaxis])[..., 0]
-
-
-def fisher_inverse(sensitivity: Sensitivity, functions: Array, prior: float = 0.0) -> FisherInverse:
-    """Inverse information about emissivities (band), object (order) [K] and resting level [K]."""
+def fisher_variance(
+    sensitivity: Sensitivity, functions: Array, prior: float
+) -> Callable[[Array], Array]:
+    """Variances by gradients with emissivities (band), object (order) [K] and resting level [K]."""
     # Over the samples, g = dz/de, p = dz/dx, v = dz/dy and w = v in the frames at rest, else 0.
     g, p = sensitivity.contrast, sensitivity.emission
     w = sensitivity.reflection * sensitivity.resting
@@ -245,12 +228,22 @@ def fisher_inverse(sensitivity: Sensitivity, functions: Array, prior: float = 0.
     cl = np.einsum("tp,tk->pk", np.sum(p * w, axis=0), functions)[..., np.newaxis]
     ll = np.sum(w**2, axis=(0, 1))[:, np.newaxis, np.newaxis]
     ce, le, lc = (np.swapaxes(block, 1, 2) for block in (ec, el, cl))
-    information = np.block([[ee, ec, el], [ce, cc, cl], [le, lc, ll]])
+    fisher = np.block([[ee, ec, el], [ce, cc, cl], [le, lc, ll]])
     # Information about each unknown, were it the only one: no background to eliminate.
     diagonal = np.concatenate(
         [np.sum(g**2, axis=1).T + prior, np.sum(p**2, axis=0).T @ functions**2, ll[..., 0]], axis=1
     )
     scale = np.sqrt(np.divide(1.0, diagonal, out=np.ones_like(diagonal), where=diagonal > 0))
-    scaled = information * scale[:, np.newaxis] * scale[..., np.newaxis]
-    eigenvalues, directions = np.linalg.eigh(scaled)
-    return FisherInverse(scale, directions, eigenvalues)
+    scaled = fisher * scale[:, np.newaxis] * scale[..., np.newaxis]
+    information, directions = np.linalg.eigh(scaled)
+
+    def variance(gradient: Array) -> Array:
+        """Smallest variance (pixel, quantity) for gradients; infinite without information."""
+        along = ((gradient * scale[:, np.newaxis]) @ directions) ** 2
+        blind = information <= _ROUNDING
+        dependent = along @ blind[..., np.newaxis] > _DEPENDENT * along.sum(axis=-1, keepdims=True)
+        # var(q) = h^T F^-1 h = sum_i (h . d_i)^2 / lambda_i
+        inverse = np.divide(1.0, information, out=np.zeros_like(blind, float), where=~blind)
+        return np.where(dependent, np.inf, along @ inverse[..., np.newaxis])[..., 0]
+
+    return variance

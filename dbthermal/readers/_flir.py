@@ -26,10 +26,10 @@ import xarray as xr
 from dbthermal import _numbers
 from dbthermal import _text as texts
 from dbthermal._arrays import Array, Mask, empty, release
-from dbthermal._warnings import warned
 from dbthermal.readers import _formats, _recording
 from dbthermal.readers._formats import Paths
 from dbthermal.readers._recording import MEMORY, Clock, Counts, FileFlag
+from dbthermal.schema import warned
 
 _IMAGE, _CAMERA = 1, 32  # types of records
 _MARKS: Final = (b"FFF\0", b"AFF\0")

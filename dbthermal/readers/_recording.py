@@ -19,8 +19,8 @@ import xarray as xr
 
 from dbthermal import _numbers, _text, schema
 from dbthermal._arrays import Array, empty, made_on_disk, stretches
-from dbthermal._warnings import warned
 from dbthermal.readers._formats import PNG
+from dbthermal.schema import warned
 
 Counts = npt.NDArray[np.uint16]
 Flags = npt.NDArray[np.uint16]

@@ -13,8 +13,8 @@ from scipy.constants import zero_Celsius
 from dbthermal import _numbers, schema
 from dbthermal._arrays import empty, stretches
 from dbthermal._text import shown
-from dbthermal._warnings import warned
 from dbthermal.readers._recording import FileFlag
+from dbthermal.schema import warned
 
 _SCENE: Final = (5.0, 100.0)  # temperatures of a scene [degC]
 _FRAMES: Final = 16  # about as many frames are sampled

@@ -14,10 +14,8 @@ from dbthermal import noise as noises
 from dbthermal import planck, schema
 from dbthermal import response as responses
 from dbthermal._arrays import Array, Mask, stride
-from dbthermal._coordinates import laid_on
-from dbthermal._warnings import warned
 from dbthermal.response import Curve
-from dbthermal.schema import Status
+from dbthermal.schema import Status, laid_on, warned
 from dbthermal.separation import _quality as quality
 from dbthermal.separation._apart import displaced
 from dbthermal.separation._apart.displaced import Displacement

@@ -13,12 +13,11 @@ import xarray as xr
 
 from dbthermal import _numbers, _samples, alignment, schema
 from dbthermal._arrays import without_blas_threads
-from dbthermal._warnings import warned
 from dbthermal.alignment._planes import Scale, displaced_windows
 from dbthermal.alignment._reflections import seen_apart
 from dbthermal.bands import FILTERS
 from dbthermal.emissivity import colour_of
-from dbthermal.schema import Status
+from dbthermal.schema import Status, warned
 from dbthermal.separation import _budget as budget
 from dbthermal.separation import _misfit as misfits
 from dbthermal.separation._apart import displaced

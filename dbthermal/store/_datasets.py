@@ -232,12 +232,8 @@ def open_dataset(path: str | Path) -> xr.Dataset:
     -------
     Dataset
         Identical to the one saved, with ``attrs["provenance"]`` added, as in the example of `save`.
-        Text is of NumPy's fixed-length kind.
-
-    Warns
-    -----
-    UserWarning
-        If the store has no checksums, as of dbthermal 0.1.0, so that damage cannot be seen.
+        Text is of NumPy's fixed-length kind. UserWarning if the store has no checksums, as of
+        dbthermal 0.1.0, so that damage cannot be seen.
     """
     if not texts.as_path(path).is_dir():
         rule = "Must be a zarr folder, as from: dbthermal import, or a later step, or `save`"

@@ -124,7 +124,10 @@ def reserved(path: str | Path) -> Iterator[Path]:
         finally:
             if lock in _LOCKED:  # not in a fork
                 with raised_signals(deferred=True):
-                    _release(lock, folder, path)
+                    _remove_remains(folder, path)
+                    _remove_holder(folder)
+                    _LOCKED.remove(lock)
+                    os.close(lock)
 
 
 def _restore(place: Path, path: Path) -> None:
@@ -159,7 +162,11 @@ def _lock(folder: Path, path: Path) -> int | None:
                 if os.path.samestat(os.fstat(lock), file.stat()):
                     with suppress(OSError):
                         os.ftruncate(lock, 0)
-                    _sign(lock, name, folder)
+                    try:
+                        os.write(lock, name.encode())
+                    except OSError:  # no room
+                        _remove_holder(folder)
+                        raise
                     _LOCKED.add(lock)
                     return lock
             finally:
@@ -167,14 +174,11 @@ def _lock(folder: Path, path: Path) -> int | None:
                     os.close(lock)
 
 
-def _release(lock: int, folder: Path, path: Path) -> None:
-    """Remove a locked folder with what was not renamed from it, and unlock it."""
-    _remove_remains(folder, path)
+def _remove_holder(folder: Path) -> None:
+    """Remove the file that names the holder of a folder, and the folder if it is empty."""
     with suppress(OSError):
         (folder / "holder").unlink()
         folder.rmdir()
-    _LOCKED.remove(lock)
-    os.close(lock)
 
 
 def take(descriptor: int, *, shared: bool = False) -> bool:
@@ -186,16 +190,6 @@ def take(descriptor: int, *, shared: bool = False) -> bool:
     except (AttributeError, OSError):  # a system, or a disk, that knows no locks
         pass
     return True
-
-
-def _sign(lock: int, name: str, folder: Path) -> None:
-    """Write a name into a locked file of a folder; without room, remove them."""
-    try:
-        os.write(lock, name.encode())
-    except OSError:
-        (folder / "holder").unlink()
-        folder.rmdir()
-        raise
 
 
 @contextmanager

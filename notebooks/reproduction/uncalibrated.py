@@ -17,7 +17,7 @@ from scipy.ndimage import shift
 from dbthermal import _smooth as smooth
 from dbthermal import alignment, schema
 from dbthermal._arrays import Array, Mask
-from dbthermal._coordinates import laid_on
+from dbthermal.schema import laid_on
 
 CORRELATED: Final = 0.5  # correlation of the bands from which a pixel enters the pooled ratio [1]
 

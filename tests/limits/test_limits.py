@@ -14,7 +14,7 @@ from refused import refused
 
 from dbthermal import emissivity, limits, mixing, simulation
 from dbthermal import response as responses
-from dbthermal.limits._planner import SKY
+from dbthermal.limits import SKY
 from dbthermal.simulation import Background, Rig
 from reproduction.experiments.cases import ratio_variance_bound, reflection_ratio
 
@@ -359,7 +359,7 @@ test_bad_plan_is_a_clear_error = refused(
         (limits.plan, (TABLE, NETD), {"beside": "7.0"}, "Missing band '7.0'"),
         (limits.plan, (TABLE, NETD), {"together": 5}, "together 5"),
         (limits.plan, (TABLE, NETD), {"together": 1.0}, "Invalid together 1.0"),
-        (limits.plan, (TABLE, NETD), {"design": 35}, "design 35. Must be a CaptureDesign"),
+        (limits.plan, (TABLE, NETD), {"design": 35}, "design of type int. Must be a CaptureDesign"),
         (limits.plan, (MIRROR, NETD), {}, "emissivity 1.2 of 'plate window glass'"),
         (limits.plan, (TABLE, MUTE), {}, "noise"),
         (limits.plan_durations, (TABLE, NETD, [2.0, 1.0]), {}, "Must increase strictly"),

@@ -242,7 +242,7 @@ def test_lag_is_that_of_a_small_body() -> None:
 
 RNG, DRAW = np.random.default_rng(0), Background("still").draw
 BAD_TIMES: list[Any] = [[0.0], [0.0, 0.0], [0.0, np.nan, 2.0], [[0.0, 1.0]]]
-INCREASE = "Must be (two or more|finite, and increase)"
+INCREASE = "Must (be two or more|be finite|increase)"
 SCENE, PLAIN = partial(simulation.scene, np.arange(4.0)), np.full((4, 1, 1), 300.0)
 WHOLE = still().astype(np.uint16)  # of which a lagging pixel of 1000 would wrap to 57,580
 TEXT: Any = "40"

@@ -21,8 +21,7 @@ from scipy.sparse import csr_array
 from dbthermal import _samples as samples
 from dbthermal import schema
 from dbthermal._arrays import Array, Mask
-from dbthermal._coordinates import laid_on
-from dbthermal.schema import Status
+from dbthermal.schema import Status, laid_on
 from dbthermal.separation import _quality as quality
 from dbthermal.separation._quality import Bits
 

@@ -11,8 +11,7 @@ import xarray as xr
 from dbthermal import _numbers, schema
 from dbthermal._arrays import empty, release, without_blas_threads
 from dbthermal._compiled import compiled
-from dbthermal._coordinates import laid_on
-from dbthermal.schema import Status
+from dbthermal.schema import Status, laid_on
 from dbthermal.separation import _quality as quality
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._budget import added, without_calibration

@@ -8,9 +8,8 @@ import xarray as xr
 from scipy.special import chdtri
 
 from dbthermal import _numbers, schema
-from dbthermal._coordinates import laid_on
 from dbthermal.noise import MAD
-from dbthermal.schema import Status
+from dbthermal.schema import Status, laid_on
 from dbthermal.separation import _frames as frames
 from dbthermal.separation import _quality as quality
 from dbthermal.separation import _windows as windows

@@ -29,8 +29,7 @@ from scipy.special import chdtri
 from dbthermal import _numbers, schema
 from dbthermal import response as responses
 from dbthermal._arrays import Array, Mask
-from dbthermal._coordinates import laid_on
-from dbthermal.schema import Status
+from dbthermal.schema import Status, laid_on
 from dbthermal.separation._inputs import Labels
 from dbthermal.separation._pooling import feature_maps, region_merging
 from dbthermal.separation._pooling.region_merging import Features, Regions

@@ -10,7 +10,7 @@ from scipy.constants import zero_Celsius
 
 from dbthermal import alignment, calibration, emissivity, schema, separation, simulation
 from dbthermal import response as responses
-from dbthermal._coordinates import laid_on
+from dbthermal.schema import laid_on
 from reproduction import methods, twins
 from reproduction.experiments.bench import Bench, Sample, bench_series
 from reproduction.experiments.cases import held, rmse, scalars

@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from scipy.constants import zero_Celsius
 
 from dbthermal import schema
-from dbthermal._coordinates import laid_on
 from dbthermal.figures import FilmPanel, drawing, film
 from dbthermal.figures.drawing import COLORS, band_label, canvas, draw_image, limits_of
+from dbthermal.schema import laid_on
 
 _CELSIUS: Final = "[\N{DEGREE SIGN}C]"
 
