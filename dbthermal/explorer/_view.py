@@ -1,5 +1,6 @@
 """View of a result or a capture: panes, frames, ranges of colour, curves, and code for them."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -54,6 +55,7 @@ class View:
     TypeError, ValueError
         If the data are no Dataset or path, or have neither temperature nor counts; a variable is
         not as `schema` says; the capture has other frames, pixels or bands; or a time is infinite.
+        UserWarning if the capture states another ``source``.
 
     Examples
     --------
@@ -99,6 +101,12 @@ class View:
         self.time = film["time"].values.astype(np.float64)
         self.shape: tuple[int, int] = film.shape[1], film.shape[2]
         shown = self.data if self.capture is None else self.capture
+        self.doubts = list[str]()
+        recorded = [str(it.attrs.get("source", "")) for it in (self.data, shown)]
+        if all(recorded) and recorded[0] != recorded[1]:
+            label = f"The result is of '{recorded[0]}', the capture beside it of '{recorded[1]}'"
+            self.doubts.append(f"{label}. Must be of the same recordings.")
+            warnings.warn(self.doubts[0], stacklevel=2)
         schema.require(events, Mapping, "events")
         stated = {
             name: _numbers.real_number(f"time [s] of the event {name!r}", moment, _numbers.FINITE)

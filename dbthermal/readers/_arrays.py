@@ -35,9 +35,10 @@ _TIMES: Final = re.compile(f"{_BESIDE.pattern}|t", re.IGNORECASE)
 _DIMS: Final = (f"{_TIMES.pattern}|frames?|images?", "y|rows?|height", "x|col(umn)?s?|width")
 _WITHOUT_NAME: Final = r"||None|(phony_)?dim_\d+"
 _NEUTRAL: Final = {"scale_factor": 1, "scale": 1, "slope": 1, "add_offset": 0, "intercept": 0}
+_VALID: Final = {"min": 0, "max": -1 % 2**16}
 _ATTRIBUTES: Final = (
     *("units", "unit", *_NEUTRAL, "_FillValue", "missing_value", "origin", "_Unsigned"),
-    *("long_name", "standard_name"),
+    *("long_name", "standard_name", "valid_min", "valid_max", "valid_range"),
 )
 _MOMENT: Final = 40  # longest text of a moment [character]
 _OBJECTS, _DEPTH = 4096, 32  # of a file of HDF5; one with more takes minutes to list
@@ -120,6 +121,14 @@ def array(
     fills = [attributes[name] for name in ("_FillValue", "missing_value") if name in attributes]
     fills = [float(fill) % 2**16 for fill in fills] if read.dtype.kind == "i" else fills
     _recording.check_present(counts, fills, label)
+    low, high = (attributes.get(f"valid_{end}", neutral) for end, neutral in _VALID.items())
+    limits = np.ravel(attributes.get("valid_range", [low, high]))
+    with _recording.damage_named(f"Invalid valid_range of '{label}'", "two numbers"):
+        low, high = limits.astype(float) % 2**16 if read.dtype.kind == "i" else limits.astype(float)
+    if counts.min() < low or counts.max() > high:
+        span = f"{counts.min()} to {counts.max()}"
+        rule = f"Must lie within valid_range, {low:g} to {high:g}: beyond, none was measured"
+        raise ValueError(f"Invalid counts of '{label}', {span}. {rule}.")
     return _recording.clocked(counts, stamps, label, format="array", **schema.origin(attributes))
 
 
@@ -189,7 +198,8 @@ def _attribute(values: Any, name: str) -> Any:
         attrs = {name: getattr(values, name)} if hasattr(values, name) else {}
     if (name := next((key for key in attrs if str(key).lower() == name.lower()), "")) == "":
         return None
-    if hasattr(attrs, "get_id") and math.prod(attrs.get_id(name).shape) > 1:
+    most = 2 if name.lower() == "valid_range" else 1
+    if hasattr(attrs, "get_id") and math.prod(attrs.get_id(name).shape) > most:
         raise ValueError(f"Invalid attribute '{name}', a list. Must be one value.")
     value = attrs[name]
     value = value.reshape(-1)[0] if isinstance(value, np.ndarray) and value.size == 1 else value

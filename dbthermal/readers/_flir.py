@@ -129,7 +129,8 @@ def flir(
     frames : slice, optional
         Frames to read, not negative; of a long or damaged recording only those are looked at.
     clock : float or array_like, optional
-        Frame rate of the file [Hz] or time of each selected frame [s], in place of its times.
+        Frame rate of the file [Hz] or time of each selected frame [s], in place of its times; a
+        warning if they differ by more than half a frame.
     byte_order, memory : {"little", "big"} or None, float
         Order of an image's bytes, in place of what is decided; largest memory that the counts may
         take [byte], refused before it is taken.
@@ -188,15 +189,22 @@ def flir(
     # Byte order, flags and times.
     order, by = _order(counts, form, byte_order, name)
     flags = np.where(same_number, 0, FileFlag.NUMBERS_DIFFER.value).astype(np.uint16)
-    seconds = np.where(same_number, seconds, np.nan)
-    if clock is not None:  # a rate is that of all frames
+    seconds, sentences = np.where(same_number, seconds, np.nan), list[str]()
+    if clock is not None:  # a rate is that of all frames; clocks of cameras may be wrong
         every = 1 if np.ndim(np.asarray(clock)) else wanted.step or 1
-        seconds = every * _recording.stamps(clock, len(counts), name)
+        stated = every * _recording.stamps(clock, len(counts), name)
+        rising = seconds > np.append(-np.inf, np.fmax.accumulate(seconds)[:-1])
+        try:
+            if rising.any():
+                _recording.check_times(seconds[rising], "s", stated[rising], name)
+        except ValueError as error:
+            sentences.append(str(error))
+        seconds = stated
     about = {"source": name, "format": f"FLIR, {form.codec}", "byte_order": order}
     about |= {"byte_order_by": by, **attrs}
     doubts = [note for note in attrs["implausible"].split("; ") if note.startswith("checksum")]
     made = _recording.recording(counts, seconds, name, about, flags)
-    return warned(made, *(f"Wrong {note}: has it been edited?" for note in doubts[:1]))
+    return warned(made, *sentences, *(f"Wrong {it}: has it been edited?" for it in doubts[:1]))
 
 
 _Found = tuple[_Content, _Frame, str]

@@ -109,6 +109,9 @@ def damage_named(label: str, rule: str) -> Iterator[None]:
     """Raise a library's error for a damaged file as one line; errors that name the file stay."""
     try:
         yield
+    except (BlockingIOError, PermissionError) as error:  # of the system: it may be whole
+        rule = "Must be readable, and closed by other programs: wait for its writer, or copy it"
+        raise type(error)(f"Unreadable {label.partition(' ')[2]}: {error}. {rule}.") from error
     except DAMAGE as error:
         refused = isinstance(error, ValueError) and "Must " in str(error)
         if refused and label.partition("'")[2] in str(error):

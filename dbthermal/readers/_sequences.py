@@ -104,7 +104,9 @@ def raw(
         likely.append(shape[1] // 2)
     if likely:
         films = [np.reshape(images, (len(images), -1, width)) for width in likely]
-        film = min(films, key=lambda film: sum(np.abs(np.diff(film, axis=n)).mean() for n in (1, 2)))
+        film = min(
+            films, key=lambda film: sum(np.abs(np.diff(film, axis=n)).mean() for n in (1, 2))
+        )
         label = f"Invalid shape {shape} of '{name}': rougher than {film.shape[1:]}"
         raise ValueError(f"{label}. Must be rows, then columns.")
     decided = {"byte_order": byte_order, "byte_order_by": "caller"}

@@ -142,7 +142,7 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
     # What was found, by whom, and what speaks against it.
     sentences, numbers["answer"] = answer(result, table_)
     about = [str(author), *(str(shot.attrs.get(name, "")) for name in ("source", "start"))]
-    doubts = [*result.attrs.get("warnings", []), *hardly_measured(result)]
+    doubts = [*result.attrs.get("warnings", []), *hardly_measured(result), *view.doubts]
     if view.capture is not None and view.response is not None:
         doubts += against_response(view.capture, view.response)
     unit, zero = view.panes["object_temperature"].unit(celsius=celsius)
