@@ -35,6 +35,7 @@ _TIMES: Final = re.compile(f"{_BESIDE.pattern}|t", re.IGNORECASE)
 _DIMS: Final = (f"{_TIMES.pattern}|frames?|images?", "y|rows?|height", "x|col(umn)?s?|width")
 _WITHOUT_NAME: Final = r"||None|(phony_)?dim_\d+"
 _NEUTRAL: Final = {"scale_factor": 1, "scale": 1, "slope": 1, "add_offset": 0, "intercept": 0}
+_RATES: Final = ("fps", "frame_rate", "framerate")  # names of a rate, of an array or its file
 _VALID: Final = {"min": 0, "max": -1 % 2**16}
 _ATTRIBUTES: Final = (
     *("units", "unit", *_NEUTRAL, "_FillValue", "missing_value", "origin", "_Unsigned"),
@@ -110,6 +111,7 @@ def array(
             lines = dict([(c.name, c) for c in coords if _are_times(c.name, c)][:1])
         attributes = _checked(values, label, unit)
         _recording.check_memory(getattr(values, "shape", ()), memory, label, stored)
+        rates = _rates(values, lines, path)
         for line in lines.items():
             seconds = _seconds(line, values.shape[0], clock, label, path)
             clock = seconds if clock is None else clock
@@ -129,7 +131,9 @@ def array(
         span = f"{counts.min()} to {counts.max()}"
         rule = f"Must lie within valid_range, {low:g} to {high:g}: beyond, none was measured"
         raise ValueError(f"Invalid counts of '{label}', {span}. {rule}.")
-    return _recording.clocked(counts, stamps, label, format="array", **schema.origin(attributes))
+    sentences = [it for rate in rates for it in _recording.another_rate(rate, stamps, label)]
+    origin = schema.origin(attributes)
+    return _recording.clocked(counts, stamps, label, *sentences, format="array", **origin)
 
 
 def _checked(values: Any, label: str, unit: str) -> dict[str, Any]:
@@ -171,6 +175,18 @@ def _seconds(line: Any, frames: int, clock: Clock | None, label: str, path: Path
     unit = "s" if times.dtype.kind in "OSU" else _attribute(times, "units")
     unit = unit or (re.search("_(s|ms|us|ns)$", str(name).lower()) or ("", ""))[1]  # by its name
     return _recording.check_times(moments, str(unit), clock, label)
+
+
+def _rates(values: Any, lines: dict[str, Any], path: Path) -> list[Any]:
+    """Frame rates by attributes of an array and its file, or by numbers, taken out of its times."""
+    rates = list[Any]()
+    for number in [lines.pop(key) for key in [*lines] if key.lower() in _RATES]:
+        _check_whole(number, path)
+        rates.append(_moments(number))
+    for holder in (values, getattr(values, "parent", None), getattr(values, "file", None)):
+        with suppress(ValueError):  # of a list
+            rates += [_attribute(holder, key) for key in _RATES]
+    return rates
 
 
 def _dims_of(values: Any) -> list[Any]:
@@ -254,10 +270,12 @@ def _opened(path: Path, name: str | None, stack: ExitStack) -> tuple[Any, dict[s
     warnings.simplefilter("error", UserWarning)  # as of one dimension twice
     arrays = _OPENED[kind](path, stack)
     shapes = [f"{key} {tuple(array.shape)}" for key, array in arrays.items()]
+    names = {key: key.rpartition("/")[2] for key, array in arrays.items() if array.size == 1}
+    rates = {name: arrays[key] for key, name in names.items() if name.lower() in _RATES}
     arrays = {n: array for n, array in arrays.items() if array.ndim == 3 or _are_times(n, array)}
     films = [key for key in arrays if arrays[key].ndim == 3]
     name = _recording.array_name(films, name, path, shapes)
-    return arrays[name], _times_of(arrays, name, path)
+    return arrays[name], _times_of(arrays, name, path) | rates
 
 
 def _read(values: Any, path: Path) -> npt.NDArray[Any]:

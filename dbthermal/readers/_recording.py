@@ -236,6 +236,17 @@ def check_times(values: npt.NDArray[Any], unit: str, clock: Clock | None, name: 
     return np.asarray(seconds)
 
 
+def another_rate(rate: Any, seconds: Array, name: str) -> list[str]:
+    """Sentence on a frame rate [Hz] that a file states, if the stated clock has another one."""
+    with suppress(TypeError, ValueError):
+        stated = float(np.asarray(rate).item())
+        if abs((len(seconds) - 1) - seconds[-1] * stated) > 0.5 and 0 < stated < _FASTEST:
+            rule = "Must be the rate of recording; that in the file may be of playing it"
+            label = f"'{name}' states {stated:g} frames a second, and clock= another rate"
+            return [f"{label}. {rule}."]
+    return []
+
+
 def byte_order(name: str, value: str) -> str:
     """Byte order as numpy writes it, of 'little' or 'big'."""
     if str(value) not in ORDERS.values():

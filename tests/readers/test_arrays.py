@@ -270,7 +270,8 @@ def test_counts_beyond_the_valid_range(tmp_path: Path, limits: dict[str, Any]) -
 
 def test_a_file_that_is_being_written_is_not_damaged(tmp_path: Path) -> None:
     """Another program holds its lock: it is named as unreadable."""
-    code = f"import h5py; file = h5py.File({str(tmp_path / 'a.h5')!r}, 'w'); print(flush=True); input()"
+    opened = f"file = h5py.File({str(tmp_path / 'a.h5')!r}, 'w')"
+    code = f"import h5py; {opened}; print(flush=True); input()"
     pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
     with subprocess.Popen([sys.executable, "-c", code], **pipes) as writer:
         writer.stdout.readline()
@@ -279,6 +280,24 @@ def test_a_file_that_is_being_written_is_not_damaged(tmp_path: Path) -> None:
         ):
             readers.array(tmp_path / "a.h5", unit="count", clock=9.0)
         writer.communicate(b"\n")
+
+
+@pytest.mark.parametrize("place", ["array", "file", "number", "npz"])
+def test_a_frame_rate_in_a_file_is_compared_with_the_clock(tmp_path: Path, place: str) -> None:
+    """It is no clock, but a warning says if it is another."""
+    path = tmp_path / ("a.npz" if place == "npz" else "a.h5")
+    if place == "npz":
+        np.savez(path, frames=scene(), fps=25.0)
+    else:
+        with h5py.File(path, "w") as file:
+            file["film/frames"] = scene()
+            attrs = (file if place == "file" else file["film/frames"]).attrs
+            attrs.update({"FrameRate": 25} if place != "number" else {})
+            if place == "number":
+                file["film/fps"] = [[25.0]]
+    assert "warnings" not in read(path, clock=25.0).attrs
+    with pytest.warns(UserWarning, match=rf"'{path.name}' states 25 frames a second, and clock="):
+        read(path, clock=10.0)
 
 
 def test_missing_counts_of_a_file(tmp_path: Path) -> None:
