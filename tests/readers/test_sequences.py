@@ -115,7 +115,7 @@ def test_bytes_of_a_picture_are_no_counts(tmp_path: Path) -> None:
 def test_signed_numbers_are_no_counts(tmp_path: Path) -> None:
     """Temperatures about 0 degC, as DJI's program writes them; saturated pixels are none."""
     path, (y, x) = tmp_path / "a.raw", np.mgrid[:48, :64]
-    celsius = np.rint(70 + 80 * np.sin(y / 9) + 20 * np.cos(x / 11) + np.arange(3)[:, None, None])
+    celsius = np.rint(150 + 165 * np.sin(y / 9) + 5 * np.cos(x / 11) + np.arange(3)[:, None, None])
     path.write_bytes(celsius.astype("<i2").tobytes())
     with pytest.raises(ValueError, match=r"Invalid counts of 'a\.raw': as of signed numbers"):
         bare(path, shape=(48, 64))
