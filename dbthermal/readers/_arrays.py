@@ -36,7 +36,6 @@ _DIMS: Final = (f"{_TIMES.pattern}|frames?|images?", "y|rows?|height", "x|col(um
 _WITHOUT_NAME: Final = r"||None|(phony_)?dim_\d+"
 _NEUTRAL: Final = {"scale_factor": 1, "scale": 1, "slope": 1, "add_offset": 0, "intercept": 0}
 _RATES: Final = ("fps", "frame_rate", "framerate")  # names of a rate, of an array or its file
-_VALID: Final = {"min": 0, "max": -1 % 2**16}
 _ATTRIBUTES: Final = (
     *("units", "unit", *_NEUTRAL, "_FillValue", "missing_value", "origin", "_Unsigned"),
     *("long_name", "standard_name", "valid_min", "valid_max", "valid_range"),
@@ -123,14 +122,10 @@ def array(
     fills = [attributes[name] for name in ("_FillValue", "missing_value") if name in attributes]
     fills = [float(fill) % 2**16 for fill in fills] if read.dtype.kind == "i" else fills
     _recording.check_present(counts, fills, label)
-    low, high = (attributes.get(f"valid_{end}", neutral) for end, neutral in _VALID.items())
-    limits = np.ravel(attributes.get("valid_range", [low, high]))
-    with _recording.damage_named(f"Invalid valid_range of '{label}'", "two numbers"):
-        low, high = limits.astype(float) % 2**16 if read.dtype.kind == "i" else limits.astype(float)
+    low, high = attributes["valid_range"]
     if counts.min() < low or counts.max() > high:
-        span = f"{counts.min()} to {counts.max()}"
         rule = f"Must lie within valid_range, {low:g} to {high:g}: beyond, none was measured"
-        raise ValueError(f"Invalid counts of '{label}', {span}. {rule}.")
+        raise ValueError(f"Invalid counts of '{label}', {counts.min()} to {counts.max()}. {rule}.")
     sentences = [it for rate in rates for it in _recording.another_rate(rate, stamps, label)]
     origin = schema.origin(attributes)
     return _recording.clocked(counts, stamps, label, *sentences, format="array", **origin)
@@ -158,6 +153,9 @@ def _checked(values: Any, label: str, unit: str) -> dict[str, Any]:
     if named := re.search("temperature|celsius|kelvin", titles, re.IGNORECASE):
         rule = "Must be counts: if it is, rename the array or its long_name"
         raise ValueError(f"Invalid array of '{label}', named '{named.group()}'. {rule}.")
+    ends = [attributes.get("valid_min", 0), attributes.get("valid_max", 2**16 - 1)]
+    low, high = np.ravel(attributes.get("valid_range", ends)).astype(float) % 2**16  # with signs
+    attributes["valid_range"] = low, high
     text = str(attributes.get("units", attributes.get("unit", unit))).strip()
     _recording.check_unit(unit if text in {"", "1"} else text, label)
     return attributes
@@ -246,11 +244,8 @@ def _times_of(arrays: dict[str, Any], name: str, path: Path) -> dict[str, Any]:
     if dims and (group, dims[0]) in lines:
         return {dims[0]: lines[group, dims[0]]}
     films = sum(array.ndim == 3 for array in arrays.values())
-    named = {
-        key: array
-        for (place, key), array in lines.items()
-        if _BESIDE.fullmatch(key) and (place == group or films == 1)
-    }
+    beside = [(place, key) for place, key in lines if place == group or films == 1]
+    named = {key: lines[place, key] for place, key in beside if _BESIDE.fullmatch(key)}
     for key, number in ((key, times.size) for key, times in named.items()):
         if number != frames and number in image:
             label = f"'{name}' of '{path.name}', {frames} frames of {image}: '{key}' has {number}"

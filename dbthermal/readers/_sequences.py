@@ -17,8 +17,7 @@ from dbthermal.readers._recording import MEMORY, SMOOTHER, Clock, Counts
 
 _FIRST: Final = 8  # frames that tell rows from columns
 _LONGER: Final = 64  # factor of roughness between the parts of a longer number
-# Halves of a row are rows: distances of halves, of right images up to 1.03, of FLIR's samples in
-# rows of twice the length 1.1 to 2.0, and of noise 1.2 in as few pixels.
+# Distances of rows over those of halves: FLIR's samples 1.03, doubled 1.1 to 2; noise 1.2.
 _HALVES, _FEWEST = 1.3, 192
 _LONGEST: Final = 2**16  # header of an .sfmov, or its .inc [byte]
 # Header of a Telops frame: length [byte], rate [mHz], time [s] and its fraction [100 ns], and more.
@@ -146,10 +145,9 @@ def _halves_are_rows(image: npt.NDArray[np.int32]) -> bool:
     if image.size < _FEWEST or len(image) == 1:
         return False
     halves = image.reshape(2 * len(image), -1)
-    near = np.abs(np.diff(halves, axis=0))  # within a row, then from a row to the row below
+    near = np.abs(np.diff(halves, axis=0)).mean(axis=1)  # in a row, to the row below, in a row
     next_but_one = np.abs(halves[2:] - halves[:-2]).mean()
-    within, across = near[::2].mean(), near[1::2].mean()
-    return bool(next_but_one > _HALVES * max(within, across))
+    return bool(next_but_one > _HALVES * max(near[::2].mean(), near[1::2].mean()))
 
 
 def _are_longer(counts: Counts) -> bool:

@@ -274,6 +274,7 @@ def test_a_file_that_is_being_written_is_not_damaged(tmp_path: Path) -> None:
     code = f"import h5py; {opened}; print(flush=True); input()"
     pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
     with subprocess.Popen([sys.executable, "-c", code], **pipes) as writer:
+        assert writer.stdout is not None
         writer.stdout.readline()
         with pytest.raises(
             BlockingIOError, match=r"Unreadable 'a\.h5': .* closed by other programs"
