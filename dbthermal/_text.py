@@ -12,8 +12,7 @@ import re
 import stat
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
-from itertools import chain, takewhile
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
@@ -29,7 +28,6 @@ SHOWN: Final = 60  # longest value in a message [character]
 _DEPTH: Final = 50  # of nested lists and mappings in YAML
 _LARGEST: Final = 2**53  # up to here whole numbers are exact also as float
 _CONTROL: Final = re.compile(r"[\x00-\x08\x0b-\x1f\x7f]")
-_DIGITS: Final = re.compile(r"[0-9eE.+ -]*")
 _DECIMAL: Final = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?")
 # Numbers that YAML 1.1 and 1.2 read alike: 012, 1e3 and 1_000 are not among them.
 _WHOLE: Final = re.compile(r"[-+]?(0|[1-9][0-9]{,15})")
@@ -162,22 +160,13 @@ def numbers(rows: Sequence[Row], width: int, source: str) -> NDArray[np.float64]
     """Values (row, column) of rows that must all be `width` numbers; see `number`."""
     if not rows:
         raise ValueError(f"Empty table in '{source}'. Must hold at least one row.")
+    values = list[list[float]]()
     for line, row in rows:
         if len(row) != width:
             place = at(source, line)
             raise ValueError(f"{place}: Invalid row {shown(row)}. Must be {width} numbers.")
-    texts = [row for _, row in rows]
-    if _DIGITS.fullmatch(" ".join(chain.from_iterable(texts))):
-        with suppress(ValueError):
-            values = np.array(texts, dtype=np.float64)
-            if np.isfinite(values).all():
-                return values
-    return np.array(  # slowly, to name the first that is none
-        [
-            [number(text, at(source, line, column)) for column, text in enumerate(row, 1)]
-            for line, row in rows
-        ]
-    )
+        values.append([number(text, at(source, line, n)) for n, text in enumerate(row, 1)])
+    return np.array(values)
 
 
 def read_yaml(path: str | Path) -> dict[Any, Any]:

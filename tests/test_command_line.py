@@ -644,6 +644,7 @@ calibrate -o x.zarr -> Missing source. Must be one of --at, --blackbody
 calibrate --at 5C a5.tif + b5.tif --bands a b --clock 9 -o x.zarr -> Invalid blackbody frames of 1
 demo x --side -> unrecognized arguments: --side Did you mean '--side-by-side'
 demo noise.tif -> There is something at 'noise.tif'. Must be new, or a folder.
+import a.tif b.tif --bands a b --clock 9 --offset 0 -o folder -> Invalid output 'folder'. Must end
 info noise.tif -> Damaged TIFF 'noise.tif': not a TIFF file: header=b'
 import folder --bands a b --clock 10 -o x.zarr -> Invalid folder .* Must be files: folder/
 info folder -> Invalid folder 'folder', no whole zarr. Must be files: folder/.*.tif

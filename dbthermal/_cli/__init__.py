@@ -104,12 +104,12 @@ def sources_and_targets(options: Namespace) -> tuple[list[Path], list[Path]]:
             label = f"Invalid output '{path}': an input or another output lies there"
             raise ValueError(f"{label}. Must be another place.")
         taken.append(place)
+        if "output" in options and not path.name.endswith(end):
+            raise ValueError(f"Invalid output '{path}'. Must end in '{end}'.")
         may_exist = getattr(options, "overwrite", path.is_dir())
         if (path.exists() or path.is_symlink()) and not may_exist:
             rule = "new, or --overwrite" if "overwrite" in options else "new, or a folder"
             raise FileExistsError(f"There is something at '{path}'. Must be {rule}.")
-        if "output" in options and not path.name.endswith(end):
-            raise ValueError(f"Invalid output '{path}'. Must end in '{end}'.")
     return sources, targets
 
 

@@ -324,12 +324,9 @@ def plan(expected: xr.Dataset, durations: xr.Dataset, materials: Sequence[str]) 
     filtered = best[np.isin(best.values, std["filter"].values)]
     for index, name in enumerate(filtered["material"].values):
         chosen = str(filtered.sel(material=name).item())
-        bar_axis.loglog(
-            durations["seconds"],
-            durations["object_temperature_std"].sel(material=name, filter=chosen),
-            label=f"{name}, {chosen} {_MICRO}",
-            **drawing.marked_line(index),
-        )
+        line = durations["object_temperature_std"].sel(material=name, filter=chosen)
+        style = {"label": f"{name}, {chosen} {_MICRO}", **drawing.marked_line(index)}
+        bar_axis.loglog(durations["seconds"], line, **style)
     drawing.plain_ticks(bar_axis, durations["seconds"])
     drawing.plain_decades(bar_axis)
     bar_axis.set(xlabel="length of the film [s]", ylabel="expected std [K]")
@@ -401,13 +398,10 @@ def status(result: xr.Dataset) -> Figure:
     map_axis.set(xticks=[], yticks=[])
     legend_axis.set_axis_off()
     # Legend with shares.
-    patches = [
-        Patch(facecolor=color, edgecolor="0.5", label=f"{drawing.percent(share)}  {words}")
-        for words, color, share in shown
-    ]
-    legend_axis.legend(
-        handles=patches, loc="upper left", borderaxespad=0.0, frameon=False, fontsize=9
-    )
+    labels = [f"{drawing.percent(share)}  {words}" for words, _, share in shown]
+    patches = [Patch(facecolor=color, edgecolor="0.5") for _, color, _ in shown]
+    style: Any = {"loc": "upper left", "borderaxespad": 0.0, "frameon": False, "fontsize": 9}
+    legend_axis.legend(patches, labels, **style)
     shares = {words: share for words, _, share in shown}
     completed = sum(share for words, share in shares.items() if "completed" in words)
     good = f"{drawing.percent(shares.get(_GOOD[0], 0.0))} of the pixels have no flag"
@@ -430,6 +424,5 @@ def first_reason(flags: xr.DataArray) -> npt.NDArray[np.str_]:
     unknown = int(np.bitwise_or.reduce(bits, axis=None)) & ~sum(schema.Status)
     if unknown:
         raise ValueError(f"Unknown bits {unknown} of a status. Must be of {schema.Status.bits()}.")
-    names = sorted(schema.Status.bits(), key=list(REASONS).index)
-    masks = [(bits & schema.Status.bits()[name]) != 0 for name in names]
-    return np.select(masks, [np.array(name) for name in names], default=np.array(""))
+    masks = [(bits & schema.Status.bits()[name]) != 0 for name in REASONS]
+    return np.select(masks, [np.array(name) for name in REASONS], default=np.array(""))

@@ -18,6 +18,8 @@ COLORS: Final = ("#0072b2", "#d55e00", "#009e73", "#e69f00", "#cc79a7")
 """Colours of the bands, in their order, told apart by the colour-blind (Wong 2011,
 doi:10.1038/nmeth.1618)."""
 
+TALLEST: Final = 12.0  # row of a figure [inch]; codecs of films end at 16384 pixels
+
 MARKERS: Final = "osD^vPX*"  # of lines, in their order
 
 
@@ -31,8 +33,10 @@ def canvas(
     rows, columns : int
         Numbers of axes.
     size : tuple of float
-        Width and height [inch]; both less in proportion if a style in force is narrower.
+        Width and height [inch]; both less in proportion if a style in force is narrower. A row is
+        at most `TALLEST`, beside which tall images are narrow.
     """
+    size = size[0], min(size[1], rows * TALLEST)
     width = mpl.rcParams["figure.figsize"][0]
     if width != mpl.rcParamsDefault["figure.figsize"][0] and width < size[0]:
         size = width, size[1] * width / size[0]

@@ -35,9 +35,10 @@ _TIMES: Final = re.compile(f"{_BESIDE.pattern}|t", re.IGNORECASE)
 _DIMS: Final = (f"{_TIMES.pattern}|frames?|images?", "y|rows?|height", "x|col(umn)?s?|width")
 _WITHOUT_NAME: Final = r"||None|(phony_)?dim_\d+"
 _NEUTRAL: Final = {"scale_factor": 1, "scale": 1, "slope": 1, "add_offset": 0, "intercept": 0}
+_RATES: Final = ("fps", "frame_rate", "framerate")  # names of a rate, of an array or its file
 _ATTRIBUTES: Final = (
     *("units", "unit", *_NEUTRAL, "_FillValue", "missing_value", "origin", "_Unsigned"),
-    *("long_name", "standard_name"),
+    *("long_name", "standard_name", "valid_min", "valid_max", "valid_range"),
 )
 _MOMENT: Final = 40  # longest text of a moment [character]
 _OBJECTS, _DEPTH = 4096, 32  # of a file of HDF5; one with more takes minutes to list
@@ -109,6 +110,7 @@ def array(
             lines = dict([(c.name, c) for c in coords if _are_times(c.name, c)][:1])
         attributes = _checked(values, label, unit)
         _recording.check_memory(getattr(values, "shape", ()), memory, label, stored)
+        rates = _rates(values, lines, path)
         for line in lines.items():
             seconds = _seconds(line, values.shape[0], clock, label, path)
             clock = seconds if clock is None else clock
@@ -120,7 +122,13 @@ def array(
     fills = [attributes[name] for name in ("_FillValue", "missing_value") if name in attributes]
     fills = [float(fill) % 2**16 for fill in fills] if read.dtype.kind == "i" else fills
     _recording.check_present(counts, fills, label)
-    return _recording.clocked(counts, stamps, label, format="array", **schema.origin(attributes))
+    low, high = attributes["valid_range"]
+    if counts.min() < low or counts.max() > high:
+        rule = f"Must lie within valid_range, {low:g} to {high:g}: beyond, none was measured"
+        raise ValueError(f"Invalid counts of '{label}', {counts.min()} to {counts.max()}. {rule}.")
+    sentences = [it for rate in rates for it in _recording.another_rate(rate, stamps, label)]
+    origin = schema.origin(attributes)
+    return _recording.clocked(counts, stamps, label, *sentences, format="array", **origin)
 
 
 def _checked(values: Any, label: str, unit: str) -> dict[str, Any]:
@@ -145,6 +153,9 @@ def _checked(values: Any, label: str, unit: str) -> dict[str, Any]:
     if named := re.search("temperature|celsius|kelvin", titles, re.IGNORECASE):
         rule = "Must be counts: if it is, rename the array or its long_name"
         raise ValueError(f"Invalid array of '{label}', named '{named.group()}'. {rule}.")
+    ends = [attributes.get("valid_min", 0), attributes.get("valid_max", 2**16 - 1)]
+    low, high = np.ravel(attributes.get("valid_range", ends)).astype(float) % 2**16  # with signs
+    attributes["valid_range"] = low, high
     text = str(attributes.get("units", attributes.get("unit", unit))).strip()
     _recording.check_unit(unit if text in {"", "1"} else text, label)
     return attributes
@@ -162,6 +173,18 @@ def _seconds(line: Any, frames: int, clock: Clock | None, label: str, path: Path
     unit = "s" if times.dtype.kind in "OSU" else _attribute(times, "units")
     unit = unit or (re.search("_(s|ms|us|ns)$", str(name).lower()) or ("", ""))[1]  # by its name
     return _recording.check_times(moments, str(unit), clock, label)
+
+
+def _rates(values: Any, lines: dict[str, Any], path: Path) -> list[Any]:
+    """Frame rates by attributes of an array and its file, or by numbers, taken out of its times."""
+    rates = list[Any]()
+    for number in [lines.pop(key) for key in [*lines] if key.lower() in _RATES]:
+        _check_whole(number, path)
+        rates.append(_moments(number))
+    for holder in (values, getattr(values, "parent", None), getattr(values, "file", None)):
+        with suppress(ValueError):  # of a list
+            rates += [_attribute(holder, key) for key in _RATES]
+    return rates
 
 
 def _dims_of(values: Any) -> list[Any]:
@@ -189,7 +212,8 @@ def _attribute(values: Any, name: str) -> Any:
         attrs = {name: getattr(values, name)} if hasattr(values, name) else {}
     if (name := next((key for key in attrs if str(key).lower() == name.lower()), "")) == "":
         return None
-    if hasattr(attrs, "get_id") and math.prod(attrs.get_id(name).shape) > 1:
+    most = 2 if name.lower() == "valid_range" else 1
+    if hasattr(attrs, "get_id") and math.prod(attrs.get_id(name).shape) > most:
         raise ValueError(f"Invalid attribute '{name}', a list. Must be one value.")
     value = attrs[name]
     value = value.reshape(-1)[0] if isinstance(value, np.ndarray) and value.size == 1 else value
@@ -220,11 +244,8 @@ def _times_of(arrays: dict[str, Any], name: str, path: Path) -> dict[str, Any]:
     if dims and (group, dims[0]) in lines:
         return {dims[0]: lines[group, dims[0]]}
     films = sum(array.ndim == 3 for array in arrays.values())
-    named = {
-        key: array
-        for (place, key), array in lines.items()
-        if _BESIDE.fullmatch(key) and (place == group or films == 1)
-    }
+    beside = [(place, key) for place, key in lines if place == group or films == 1]
+    named = {key: lines[place, key] for place, key in beside if _BESIDE.fullmatch(key)}
     for key, number in ((key, times.size) for key, times in named.items()):
         if number != frames and number in image:
             label = f"'{name}' of '{path.name}', {frames} frames of {image}: '{key}' has {number}"
@@ -244,10 +265,12 @@ def _opened(path: Path, name: str | None, stack: ExitStack) -> tuple[Any, dict[s
     warnings.simplefilter("error", UserWarning)  # as of one dimension twice
     arrays = _OPENED[kind](path, stack)
     shapes = [f"{key} {tuple(array.shape)}" for key, array in arrays.items()]
+    names = {key: key.rpartition("/")[2] for key, array in arrays.items() if array.size == 1}
+    rates = {name: arrays[key] for key, name in names.items() if name.lower() in _RATES}
     arrays = {n: array for n, array in arrays.items() if array.ndim == 3 or _are_times(n, array)}
     films = [key for key in arrays if arrays[key].ndim == 3]
     name = _recording.array_name(films, name, path, shapes)
-    return arrays[name], _times_of(arrays, name, path)
+    return arrays[name], _times_of(arrays, name, path) | rates
 
 
 def _read(values: Any, path: Path) -> npt.NDArray[Any]:

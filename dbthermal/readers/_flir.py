@@ -56,18 +56,11 @@ _FIELDS: Final = {  # place in the camera's record [byte], type, and limits of p
     "range_min": (0x94, "f", 70.0, 2000.0),
     "frame_rate": (0x464, "H", 1, 1000),
 }
-_TEXTS: Final = {
-    "camera_model": (0xD4, 32),
-    "camera_part_number": (0xF4, 16),
-    "camera_serial_number": (0x104, 16),
-    "camera_software": (0x114, 16),
-    "lens_model": (0x170, 32),
-    "lens_part_number": (0x190, 16),
-    "lens_serial_number": (0x1A0, 16),
-    "filter_model": (0x1EC, 16),
-    "filter_part_number": (0x1FC, 32),
-    "filter_serial_number": (0x21C, 32),
-}
+_TEXTS: Final = {"camera_software": (0x114, 16)}  # place and size [byte]
+_TEXTS.update(camera_model=(0xD4, 32), lens_model=(0x170, 32), filter_model=(0x1EC, 16))
+_TEXTS.update(camera_part_number=(0xF4, 16), camera_serial_number=(0x104, 16))
+_TEXTS.update(lens_part_number=(0x190, 16), lens_serial_number=(0x1A0, 16))
+_TEXTS.update(filter_part_number=(0x1FC, 32), filter_serial_number=(0x21C, 32))
 _TIME: Final = 0x384  # whole seconds since 1970 UTC, milliseconds
 _CAMERA_SIZE: Final = 0x466
 _IMAGE_SIZE: Final = 32  # of what precedes the counts
@@ -129,7 +122,8 @@ def flir(
     frames : slice, optional
         Frames to read, not negative; of a long or damaged recording only those are looked at.
     clock : float or array_like, optional
-        Frame rate of the file [Hz] or time of each selected frame [s], in place of its times.
+        Frame rate of the file [Hz] or time of each selected frame [s], in place of its times; a
+        warning if they differ by more than half a frame.
     byte_order, memory : {"little", "big"} or None, float
         Order of an image's bytes, in place of what is decided; largest memory that the counts may
         take [byte], refused before it is taken.
@@ -188,15 +182,22 @@ def flir(
     # Byte order, flags and times.
     order, by = _order(counts, form, byte_order, name)
     flags = np.where(same_number, 0, FileFlag.NUMBERS_DIFFER.value).astype(np.uint16)
-    seconds = np.where(same_number, seconds, np.nan)
-    if clock is not None:  # a rate is that of all frames
+    seconds, sentences = np.where(same_number, seconds, np.nan), list[str]()
+    if clock is not None:  # a rate is that of all frames; clocks of cameras may be wrong
         every = 1 if np.ndim(np.asarray(clock)) else wanted.step or 1
-        seconds = every * _recording.stamps(clock, len(counts), name)
+        by_clock = every * _recording.stamps(clock, len(counts), name)
+        rising = seconds > np.append(-np.inf, np.fmax.accumulate(seconds)[:-1])
+        try:
+            if rising.any():
+                _recording.check_times(seconds[rising], "s", by_clock[rising], name)
+        except ValueError as error:
+            sentences.append(str(error))
+        seconds = by_clock
     about = {"source": name, "format": f"FLIR, {form.codec}", "byte_order": order}
     about |= {"byte_order_by": by, **attrs}
     doubts = [note for note in attrs["implausible"].split("; ") if note.startswith("checksum")]
     made = _recording.recording(counts, seconds, name, about, flags)
-    return warned(made, *(f"Wrong {note}: has it been edited?" for note in doubts[:1]))
+    return warned(made, *sentences, *(f"Wrong {it}: has it been edited?" for it in doubts[:1]))
 
 
 _Found = tuple[_Content, _Frame, str]
@@ -309,10 +310,8 @@ def _cameras(listed: Sequence[_Found], *, timed: bool) -> tuple[Array, Mask, dic
         if whole:
             milliseconds[number] = whole * 1000 + (thousandths & 0xFFFF)
         # Settings and constants, which must not change after the first frame.
-        camera = {
-            key: struct.unpack_from(order + code, body, start)[0]
-            for key, (start, code, *_) in _FIELDS.items()
-        }
+        fields = {key: (order + code, body, at) for key, (at, code, *_) in _FIELDS.items()}
+        camera = {key: struct.unpack_from(*field)[0] for key, field in fields.items()}
         first = first or camera | {"body": body}
         for key in _CONSTANTS:
             if camera[key] != first[key]:

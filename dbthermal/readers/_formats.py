@@ -43,7 +43,7 @@ _FOREIGN: Final = {  # what to do with a format that no reader opens, by suffix 
     **dict.fromkeys(("gzip", "bzip2", "xz", "zstd", "7z", "rar"), "unpack it"),
     **dict.fromkeys(("PGM", "JPEG 2000"), "save it as PNG of 16 bits and use readers.tiff"),
     **dict.fromkeys((".xlsx", ".xlsm", ".xls", ".ods"), "a table: export 16-bit counts as TIFF"),
-    "text": "a table of temperatures, or a page of a server? Export 16-bit counts as TIFF",
+    "text": "a table, a page of a server, a pointer of Git LFS? Export 16-bit counts as TIFF",
 }
 _LARGEST: Final = 2**46  # of a file that is not read at once [byte]
 _TEXT: Final = 512  # bytes at the beginning of a file, without a control character

@@ -41,6 +41,7 @@ _APART: Final = 1.3  # axes whose roughness differs by this factor are of anothe
 _PACKED: Final = 64  # most bytes of counts in a byte of a file; .csq at hand 11, packed TIFF 3
 SMALL: Final = 2**26  # size beyond which a recording is compared with its file [byte]
 _PIECES: Final = 2**14  # of less than 1 kB in a file
+_NEAR: Final = 256  # of neighbours, as signed numbers; of DJI's temperatures [0.1 K] median 3
 _LISTED: Final = 16  # names of arrays in a message
 ORDERS: Final = {"<": "little", ">": "big"}  # of bytes, as numpy and people write them
 _JITTER: Final = 0.25  # of the times in names of files [frame]
@@ -109,6 +110,9 @@ def damage_named(label: str, rule: str) -> Iterator[None]:
     """Raise a library's error for a damaged file as one line; errors that name the file stay."""
     try:
         yield
+    except (BlockingIOError, PermissionError) as error:  # of the system: it may be whole
+        rule = "Must be readable, and closed by other programs: wait for its writer, or copy it"
+        raise type(error)(f"Unreadable {label.partition(' ')[2]}: {error}. {rule}.") from error
     except DAMAGE as error:
         refused = isinstance(error, ValueError) and "Must " in str(error)
         if refused and label.partition("'")[2] in str(error):
@@ -233,6 +237,17 @@ def check_times(values: npt.NDArray[Any], unit: str, clock: Clock | None, name: 
     return np.asarray(seconds)
 
 
+def another_rate(rate: Any, seconds: Array, name: str) -> list[str]:
+    """Sentence on a frame rate [Hz] that a file states, if the stated clock has another one."""
+    with suppress(TypeError, ValueError):
+        stated = float(np.asarray(rate).item())
+        if abs((len(seconds) - 1) - seconds[-1] * stated) > 0.5 and 0 < stated < _FASTEST:
+            rule = "Must be the rate of recording; that in the file may be of playing it"
+            label = f"'{name}' states {stated:g} frames a second, and clock= another rate"
+            return [f"{label}. {rule}."]
+    return []
+
+
 def byte_order(name: str, value: str) -> str:
     """Byte order as numpy writes it, of 'little' or 'big'."""
     if str(value) not in ORDERS.values():
@@ -310,9 +325,21 @@ def _of_8_bits(counts: Counts) -> bool:
     return bool(levels[-1] < 2**8 or np.gcd.reduce(np.diff(levels), initial=0) >= 2**8)
 
 
+def _check_unsigned(counts: Counts, name: str) -> None:
+    """Raise ValueError for signed numbers, as of temperatures, which pass from 0 to 65535."""
+    for image in counts[:: -(-len(counts) // 8)]:
+        steps = [np.diff(image.astype(np.int32), axis=axis).ravel() for axis in (0, 1)]
+        wraps = 2**16 - np.abs(np.concatenate(steps))
+        wraps = wraps[wraps < 2**15]  # signed; of dead beside saturated pixels few, or large
+        if wraps.size > np.sqrt(image.size) and np.median(wraps) < _NEAR:
+            rule = "Must be whole numbers from 0: counts, and no temperatures"
+            raise ValueError(f"Invalid counts of '{name}': as of signed numbers. {rule}.")
+
+
 def clocked(counts: Counts, clock: Any, name: str, *sentences: str, **attrs: str) -> xr.Dataset:
     """Dataset of one band of a file, from a rate [Hz] or times [s]."""
     seconds = stamps(clock, len(counts), name)
+    _check_unsigned(counts, name)
     made = recording(counts, seconds, name, {"source": name, **attrs})
     return warned(made, *sentences, *_time_elsewhere(counts, name))
 

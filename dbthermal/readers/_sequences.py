@@ -17,6 +17,8 @@ from dbthermal.readers._recording import MEMORY, SMOOTHER, Clock, Counts
 
 _FIRST: Final = 8  # frames that tell rows from columns
 _LONGER: Final = 64  # factor of roughness between the parts of a longer number
+# Distances of rows over those of halves: FLIR's samples 1.03, doubled 1.1 to 2; noise 1.2.
+_HALVES, _FEWEST = 1.3, 192
 _LONGEST: Final = 2**16  # header of an .sfmov, or its .inc [byte]
 # Header of a Telops frame: length [byte], rate [mHz], time [s] and its fraction [100 ns], and more.
 _HEADER: Final[np.dtype[Any]] = np.dtype(
@@ -89,12 +91,23 @@ def raw(
         raise ValueError(f"Invalid counts of '{name}': no images of 16-bit numbers. {rule}.")
     # What changes is smoother than the pattern of the pixels, and tells the width of the rows.
     further = counts[:: -(-len(counts) // _FIRST)].astype(np.int32)
-    images = [*counts[:_FIRST], *(further[1:] - further[0])]
-    size, widths = shape[0] * shape[1], range(shape[1] // 2 + 1, 2 * shape[1])
-    for width in (shape[0], *(width for width in widths if size % width == 0)):
-        if _recording.smoother(images, lambda frame: frame.reshape(-1, width)) < 0:  # noqa: B023
-            label = f"Invalid shape {shape} of '{name}': rougher than {(size // width, width)}"
-            raise ValueError(f"{label}. Must be rows, then columns.")
+    images = [counts[:_FIRST].mean(axis=0), *counts[:_FIRST], *(further[1:] - further[0])]
+    # Even and odd rows may have another level, which is no longer row.
+    level = [frame - frame.mean(axis=1, keepdims=True) for frame in images]
+    size, widths, likely = shape[0] * shape[1], range(shape[1] // 2 + 1, 2 * shape[1]), list[int]()
+    for width in (width for width in (shape[0], *widths, 2 * shape[1]) if size % width == 0):
+        alike = level if width == 2 * shape[1] else images
+        if _recording.smoother(alike, lambda frame: frame.reshape(-1, width)) < 0:  # noqa: B023
+            likely.append(width)
+    if shape[1] % 2 == 0 and any(map(_halves_are_rows, images)):
+        likely.append(shape[1] // 2)
+    if likely:
+        films = [np.reshape(images, (len(images), -1, width)) for width in likely]
+        film = min(
+            films, key=lambda film: sum(np.abs(np.diff(film, axis=n)).mean() for n in (1, 2))
+        )
+        label = f"Invalid shape {shape} of '{name}': rougher than {film.shape[1:]}"
+        raise ValueError(f"{label}. Must be rows, then columns.")
     decided = {"byte_order": byte_order, "byte_order_by": "caller"}
     return _recording.clocked(counts, clock, name, *_other_size(counts), format="raw", **decided)
 
@@ -108,9 +121,10 @@ def _other_size(counts: Counts) -> list[str]:
         return float(np.median(np.abs(rows[distance:] - rows[:-distance])) + 0.5)
 
     tried = [height // n for n in (4, 3, 2) if height % n == 0] + [n * height for n in range(1, 5)]
-    for n in (n for n in tried if 1 < n < len(rows) // 2):
-        aside = -(-n // 8)
-        if change(n) < min(change(n - aside), change(n + aside)) / SMOOTHER:
+    for n in (n for n in tried if 2 < n < len(rows) // 2):
+        aside = 2 * -(-n // 16)  # even, as even and odd rows may differ
+        unlike = [n - aside, n + aside, *[height] * (n > height)]
+        if change(n) < min(map(change, unlike)) / SMOOTHER:
             said = f"Rows of images repeat after {n}, not {height}. Must be the height of a frame."
             return [said] * (n != height)
     # Any other size, by the autocorrelation of the pixels' pattern: a gradient repeats everywhere.
@@ -124,6 +138,16 @@ def _other_size(counts: Counts) -> list[str]:
     unlike = np.abs(alike[[period - 1, period + 1, size]]).max()
     said = f"Numbers repeat after {period}, not {size}. Must be rows times columns of a frame."
     return [said] * bool(alike[period] > SMOOTHER * unlike)
+
+
+def _halves_are_rows(image: npt.NDArray[np.int32]) -> bool:
+    """Tell whether both halves of a row are rows: nearer to each other than to the next but one."""
+    if image.size < _FEWEST or len(image) == 1:
+        return False
+    halves = image.reshape(2 * len(image), -1)
+    near = np.abs(np.diff(halves, axis=0)).mean(axis=1)  # in a row, to the row below, in a row
+    next_but_one = np.abs(halves[2:] - halves[:-2]).mean()
+    return bool(next_but_one > _HALVES * max(near[::2].mean(), near[1::2].mean()))
 
 
 def _are_longer(counts: Counts) -> bool:

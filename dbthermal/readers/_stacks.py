@@ -166,10 +166,7 @@ def _times(text: str, frames: int, clock: Clock | None, name: str) -> tuple[Arra
         stated = _recording.check_times(times, unit, clock, name)
         return _recording.stamps(stated if clock is None else clock, frames, name), []
     seconds = _recording.stamps(clock, frames, name)
-    differs = rate and abs((frames - 1) / rate - seconds[-1]) > 0.5 / rate
-    rule = "Must be the rate of recording; that in the file may be of playing it"
-    sentence = f"'{name}' states {rate:g} frames a second, and clock= another rate. {rule}."
-    return seconds, [sentence] if differs else []
+    return seconds, _recording.another_rate(rate, seconds, name)
 
 
 class _Page(NamedTuple):

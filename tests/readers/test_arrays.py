@@ -4,6 +4,8 @@ import gzip
 import json
 import re
 import struct
+import subprocess
+import sys
 import zipfile
 import zlib
 from pathlib import Path
@@ -245,6 +247,58 @@ def test_dates_of_an_array_agree_with_the_clock() -> None:
     read(array.assign_coords(time=["a", "b", "c"]))
     with pytest.raises(ValueError, match=r"frame 1 at 0\.3 s, by clock= at 0\.1"):
         read(array.assign_coords(time=np.datetime64("2020-01-01", "ns") + 3 * steps))
+
+
+@pytest.mark.parametrize("limits", [{"valid_range": (0, -5336)}, {"valid_max": -5336}])
+def test_counts_beyond_the_valid_range(tmp_path: Path, limits: dict[str, Any]) -> None:
+    """They are none, by CF; of unsigned numbers in NetCDF 3 the limits have signs, too."""
+    counts = 60000 + 100 * np.arange(24).reshape(2, 3, 4)
+    for shift, fault in (
+        (2100, ""),
+        (0, "60000 to 62300. Must lie within valid_range, 0 to 60200"),
+    ):
+        film = xr.DataArray((counts - shift).astype(np.uint16).view(np.int16), dims=["t", "y", "x"])
+        attrs: Any = {name: np.array(limit, np.int16) for name, limit in limits.items()}
+        film = film.assign_attrs(attrs, _Unsigned="true")
+        film.to_dataset(name="a").to_netcdf(tmp_path / "a.nc", engine="scipy")
+        if not fault:
+            assert readers.array(tmp_path / "a.nc", unit="count", clock=9.0).counts.max() == 60200
+            continue
+        with pytest.raises(ValueError, match=fault):
+            readers.array(tmp_path / "a.nc", unit="count", clock=9.0)
+
+
+def test_a_file_that_is_being_written_is_not_damaged(tmp_path: Path) -> None:
+    """Another program holds its lock: it is named as unreadable."""
+    opened = f"file = h5py.File({str(tmp_path / 'a.h5')!r}, 'w')"
+    code = f"import h5py; {opened}; print(flush=True); input()"
+    pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen([sys.executable, "-c", code], **pipes) as writer:
+        assert writer.stdout is not None
+        writer.stdout.readline()
+        with pytest.raises(
+            BlockingIOError, match=r"Unreadable 'a\.h5': .* closed by other programs"
+        ):
+            readers.array(tmp_path / "a.h5", unit="count", clock=9.0)
+        writer.communicate(b"\n")
+
+
+@pytest.mark.parametrize("place", ["array", "file", "number", "npz"])
+def test_a_frame_rate_in_a_file_is_compared_with_the_clock(tmp_path: Path, place: str) -> None:
+    """It is no clock, but a warning says if it is another."""
+    path = tmp_path / ("a.npz" if place == "npz" else "a.h5")
+    if place == "npz":
+        np.savez(path, frames=scene(), fps=25.0)
+    else:
+        with h5py.File(path, "w") as file:
+            file["film/frames"] = scene()
+            attrs = (file if place == "file" else file["film/frames"]).attrs
+            attrs.update({"FrameRate": 25} if place != "number" else {})
+            if place == "number":
+                file["film/fps"] = [[25.0]]
+    assert "warnings" not in read(path, clock=25.0).attrs
+    with pytest.warns(UserWarning, match=rf"'{path.name}' states 25 frames a second, and clock="):
+        read(path, clock=10.0)
 
 
 def test_missing_counts_of_a_file(tmp_path: Path) -> None:

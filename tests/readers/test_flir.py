@@ -141,8 +141,12 @@ def test_lost_frames_and_clocks(path: Path) -> None:
     path.write_bytes(sequence(counts[:3], seconds=[1e9, 1e9 + 1, 1e9 + 0.5]))
     with pytest.raises(ValueError, match=r"Unordered times in 'a\.seq': frame 2 is 0.500 s before"):
         readers.flir(path)
-    assert_allclose(readers.flir(path, clock=50.0).time, [0, 0.02, 0.04])
-    assert_allclose(readers.flir(path, clock=50.0, frames=slice(0, 3, 2)).time, [0, 0.04])
+    with pytest.warns(UserWarning, match=r"times of 'a\.seq': frame 1 at 1 s, by clock= at 0\.02"):
+        assert_allclose(readers.flir(path, clock=50.0).time, [0, 0.02, 0.04])
+    with pytest.warns(UserWarning, match=r"frame 1 at 0\.5 s, by clock= at 0\.04.* half a frame"):
+        read = readers.flir(path, clock=50.0, frames=slice(0, 3, 2))
+    assert_allclose(read.time, [0, 0.04])
+    assert "warnings" not in readers.flir(path, clock=1.01, frames=slice(2)).attrs
     path.write_bytes(sequence(counts, seconds=[0.0] * 6))
     with pytest.raises(ValueError, match=r"Unknown times .* 0 of 6 frames have one. Must be given"):
         readers.flir(path)

@@ -112,6 +112,34 @@ def test_bytes_of_a_picture_are_no_counts(tmp_path: Path) -> None:
                 bare(path, byte_order=order)
 
 
+def test_signed_numbers_are_no_counts(tmp_path: Path) -> None:
+    """Temperatures about 0 degC, as DJI's program writes them; saturated pixels are none."""
+    path, (y, x) = tmp_path / "a.raw", np.mgrid[:48, :64]
+    celsius = np.rint(150 + 165 * np.sin(y / 9) + 5 * np.cos(x / 11) + np.arange(3)[:, None, None])
+    path.write_bytes(celsius.astype("<i2").tobytes())
+    with pytest.raises(ValueError, match=r"Invalid counts of 'a\.raw': as of signed numbers"):
+        bare(path, shape=(48, 64))
+    counts = (20000 + celsius).astype("<u2")
+    counts[:, 10:20, 10:20], counts[:, 10:12, 9] = 65535, 0
+    path.write_bytes(counts.tobytes())
+    assert bare(path, shape=(48, 64)).counts.max() == 65535
+
+
+def test_rows_of_half_or_twice_the_length(tmp_path: Path) -> None:
+    """A smooth image in rows of half or twice the length is refused; unlike even rows are not."""
+    path, rng = tmp_path / "a.raw", np.random.default_rng(1)
+    y, x = np.mgrid[:48, :64]
+    warm = 900 * np.exp(-((y - 20) ** 2 + (x - 40) ** 2) / 300)
+    path.write_bytes((20000 + warm + rng.normal(0.0, 3.0, (9, 48, 64))).astype("<u2").tobytes())
+    assert not bare(path, shape=(48, 64)).attrs.get("warnings")
+    for shape in ((24, 128), (96, 32)):
+        with pytest.raises(ValueError, match=r"Invalid shape .*: rougher than \(48, 64\)"):
+            bare(path, shape=shape)
+    levels = 20000 + 50 * (y % 2) + 0.3 * y + rng.normal(0.0, 3.0, (9, 48, 64))
+    path.write_bytes(levels.astype("<u2").tobytes())
+    assert bare(path, shape=(48, 64)).sizes["x"] == 64
+
+
 def test_raw(tmp_path: Path) -> None:
     """Bare numbers with and without headers, in both orders; what does not fit is refused."""
     path, counts = tmp_path / "a.raw", scene()

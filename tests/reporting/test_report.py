@@ -144,6 +144,30 @@ def test_same_result_gives_same_bytes(tmp_path: Path) -> None:
     assert (tmp_path / "first.html").read_bytes() == (tmp_path / "second.html").read_bytes()
 
 
+def test_the_capture_of_another_recording_is_noticed(tmp_path: Path) -> None:
+    """It may have the same frames and pixels; the page and a warning name both sources."""
+    result = scene()
+    film = result["object_temperature"].expand_dims(band=["8-14", "9.5"]) * 100
+    capture = film.assign_attrs(units="count").to_dataset(name="counts")
+    path, sources = tmp_path / "a.html", {"source": "a.tif and b.tif"}
+    dbthermal.report(result.assign_attrs(sources), path, capture.assign_attrs(sources))
+    with pytest.warns(
+        UserWarning, match="is of 'a.tif and b.tif', the capture beside it of 'c.tif"
+    ):
+        dbthermal.report(
+            result.assign_attrs(sources), path, capture.assign_attrs(source="c.tif and d.tif")
+        )
+    assert "capture beside it" in path.read_text("utf-8")
+
+
+def test_tall_images(tmp_path: Path) -> None:
+    """The film and the figures of a row of pixels are not as tall as it is long."""
+    values = np.full((3, 640, 1), 300.0)
+    film = xr.DataArray(values, {"time": [0.0, 0.1, 0.2]}, ("time", "y", "x"))
+    dbthermal.report(film.to_dataset(name="object_temperature"), tmp_path / "a.html")
+    assert (tmp_path / "a.html").stat().st_size < 1e6
+
+
 def test_words_stay_words(tmp_path: Path) -> None:
     """Title, regions, attributes and provenance that hold a program are shown, not run."""
     regions = {HOSTILE: Region("rectangle", ((2, 2), (6, 6)))}
