@@ -188,11 +188,3 @@ def test_colours_are_told_apart_by_the_colour_blind(matrix: str) -> None:
     pairs = combinations(range(len(lab)), 2)
     steps = [float(np.linalg.norm(lab[one] - lab[other])) for one, other in pairs]
     assert min(steps) > 10
-
-
-def test_temperatures_in_another_unit_are_refused() -> None:
-    """Data in degrees Celsius are not drawn as if they were kelvins."""
-    movie = array("time y x", 2, 5, 6).assign_attrs(units="degC")
-    inputs = array("band time y x", 2, 2, 5, 6)
-    with pytest.raises(ValueError, match="Invalid units 'degC' of the emission"):
-        figures.separated_temperatures(inputs, movie, movie, title="scene")

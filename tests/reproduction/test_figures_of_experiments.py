@@ -66,18 +66,6 @@ def test_truth_and_estimate_in_celsius() -> None:
         np.testing.assert_allclose(np.asarray(line.get_ydata()), kelvin - 273.15, rtol=0, atol=1e-9)
 
 
-def test_temperatures_in_another_unit_are_refused() -> None:
-    """Data in degrees Celsius are not drawn as if they were kelvins."""
-    movie = array("time y x", 2, 5, 6).assign_attrs(units="degC")
-    inputs = array("band time y x", 2, 2, 5, 6)
-    with pytest.raises(ValueError, match="Invalid units 'degC' of the emission"):
-        next(figures.scenes.separated_film(inputs, movie, movie, title="scene"))
-    scene = separated()
-    celsius = scene.assign(object_temperature=scene["object_temperature"].assign_attrs(units="C"))
-    with pytest.raises(ValueError, match="Invalid units 'C' of 'object_temperature' of the result"):
-        figures.scenes.truth_and_estimate(scene, celsius, (1, 2))
-
-
 def test_nothing_but_nan() -> None:
     """A figure of nothing but NaN is drawn empty and without a warning."""
     for draw in (draw_compared, draw_condition, draw_pooled, draw_truth):

@@ -328,19 +328,6 @@ def test_reference_in_view_renews_the_calibration(patches: tuple[float, ...], la
     assert found["referred"][2] > 0.9
 
 
-def test_impossible_reference_is_refused() -> None:
-    """Patches of the same temperature, of one pixel, or without a temperature each, say so."""
-    masks = xr.DataArray(np.zeros((2, *SHAPE), dtype=bool), dims=("patch", "y", "x"))
-    with pytest.raises(ValueError, match="Must differ"):
-        correction.Reference(response(), masks, (300.0, 300.0))
-    with pytest.raises(ValueError, match=r"temperatures \[K\]"):
-        correction.Reference(response(), masks, (300.0,))
-    raw = glass(1)[1].astype(np.uint16)
-    reference = correction.Reference(response(), masks, (300.0, 310.0))
-    with pytest.raises(ValueError, match="Invalid patch 0"):
-        correction.correct_capture(raw, correction.corrected_by_camera(raw), reference=reference)
-
-
 def test_without_a_drift_the_bars_are_as_long_as_the_errors() -> None:
     """The part by a drift of the background is the prior's; without it bars are those of noise."""
     errors, stds = [], []

@@ -329,20 +329,3 @@ def test_parts_of_another_run_are_refused(path: Path, tmp_path: Path) -> None:
     (parts / "plan.json").write_text("{}")
     with pytest.raises(ValueError, match=r"Invalid folder .*result\.zarr\.parts.*another"):
         separation.run(path, target, RIG.response(), memory=MEMORY, mask=mask)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"method": "nonsense"}, "Must"),
-        ({"method": separation.Method(min)}, "Unknown method Method.* of a run. Must be one of"),
-        ({"memory": 1e6}, "Invalid memory .* byte. Must be at least .* 64 frames.$"),
-    ],
-)
-def test_what_is_of_the_whole_image_is_refused(
-    path: Path, tmp_path: Path, options: dict[str, object], message: str
-) -> None:
-    """Before anything is written."""
-    with pytest.raises(ValueError, match=message):
-        separation.run(path, tmp_path / "r.zarr", RIG.response(), **options)  # type: ignore[arg-type]
-    assert not list(tmp_path.iterdir())

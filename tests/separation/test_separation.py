@@ -462,11 +462,6 @@ def case(pixels: int, seed: int, **changes: Any) -> Case:
     return cases.simulate({**GLASS, **changes}, RIG, TIME, pixels, seed)
 
 
-def error_of_ratio(result: xr.Dataset, truth: float = 2.0) -> float:
-    """Root mean square error of the second band's reflection ratio."""
-    return float(np.sqrt(((result["reflection_ratio"].sel(band="9.5") - truth) ** 2).mean()))
-
-
 def test_shared_error_bars_are_true() -> None:
     """Errors of materials of ten pixels scatter as their standard deviations state."""
     scene, capture, response = case(1000, 3)
@@ -541,14 +536,6 @@ def test_reflected_change() -> None:
         assert float(found.notnull().all("time").mean()) > 0.95
         error = float(np.sqrt(((found - true) ** 2).mean()))
         assert error < 0.02  # [K], of changes of 0.4 K
-
-
-def test_reflected_change_of_another_band() -> None:
-    """Bands in another order raise a ValueError."""
-    result = xr.Dataset(coords={"band": ["8-14", "9.5"]})
-    apparent = xr.DataArray(np.zeros((2, 1, 1, 1)), dims=("band", "time", "y", "x"))
-    with pytest.raises(ValueError, match=r"Invalid first band '9\.5'. Must be '8-14'"):
-        reflected_change(apparent.assign_coords(band=["9.5", "8-14"]), result)
 
 
 @pytest.mark.parametrize("method", ["naive", "dbvt"])
