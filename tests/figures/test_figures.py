@@ -109,10 +109,7 @@ def test_every_figure_is_tested() -> None:
 
 @pytest.mark.parametrize("name", DRAWN)
 def test_figure(name: str) -> None:
-    """A figure of measured data is drawn without a warning, has units, and is its caller's.
-
-    The title names simulated data and drawn pictures as such.
-    """
+    """Drawn without a warning, with units, its caller's; the title names simulated data."""
     draw, labels = DRAWN[name]
     check_measured(draw(origin="measured", radiometric=1), {*labels})
     assert "(simulated, not radiometric)" in titles(draw(origin="simulated", radiometric=0))

@@ -83,9 +83,7 @@ def test_condition_numbers_of_pairs() -> None:
 
 
 def test_errors_are_in_units_of_their_bound() -> None:
-    """Two bounds, of which one is missing once, and one row of errors above; below an error of 1.2
-    times its bound at 1.2.
-    """
+    """Bounds, one of which is missing once, and errors above; below, errors over bounds."""
     over = {"noise": [0.01, 0.03, 0.1], "case": ["known", "free"]}
     bound = np.array([[1.0, 2.0, 4.0], [0.5, 1.0, 2.0]])
     parts: dict[str, tuple[object, np.ndarray]] = {}

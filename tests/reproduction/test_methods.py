@@ -89,9 +89,7 @@ def test_naive_meets_the_images_and_is_wrong(glass: xr.Dataset, heated: xr.Datas
 
 
 def test_too_few_steps_are_flagged(glass: xr.Dataset) -> None:
-    """A pixel that still improves at its last step is flagged as not converged; not after a hundred
-    of the naive method.
-    """
+    """A pixel that improves at its last step is not converged; after a hundred it is."""
     _, capture, response = noisy(QUIET, 8)
     result = separation.solve(capture, response, DBVT, settings=DbvtSettings(stages=1, steps=2))
     assert np.all(result["status"].values & schema.Status.NOT_CONVERGED)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from numpy.typing import NDArray
+from scenes import held
 from scipy.constants import Boltzmann, Planck, speed_of_light
 
 from dbthermal import calibration, correction, emissivity, explorer, reporting, separation, store
@@ -102,9 +103,7 @@ def glass(
 
 def holds(result: xr.Dataset, truth: xr.Dataset, name: str = "object_temperature") -> float:
     """Share of the 95 % intervals of the pixels without a flag that hold."""
-    good = result["status"] == 0
-    inside = abs(result[name] - truth[name]) < 1.96 * result[f"{name}_std"]
-    return float(inside.where(good & result[name].notnull()).mean())
+    return held(result, truth, name, where=result["status"] == 0)
 
 
 def shared_part(result: xr.Dataset) -> Floats:

@@ -82,9 +82,7 @@ def plain(pair: Pair) -> Plain:
 
 @every_method
 def test_result_is_as_the_schema_has_it(pair: Pair, method: str) -> None:
-    """The result satisfies the glossary, and leaves the capture unchanged; what has no value is
-    named in `not_estimated`; a saturated pixel keeps the flag that the correction gave it.
-    """
+    """As in the glossary, with what has no value named; inputs and their flags stay."""
     status = np.zeros((4, 6), dtype=np.uint32)
     status[0, 0] = Status.SATURATED
     capture = pair[0].assign(status=(("y", "x"), status))
@@ -208,9 +206,7 @@ def spoilt(capture: xr.Dataset, bit: Status) -> xr.Dataset:
 @every_method
 @pytest.mark.parametrize("bit", [Status.DEAD_PIXEL, Status.INVALID_SAMPLES, Status.CONSTANT_SIGNAL])
 def test_bad_pixel_is_flagged_and_alone(pair: Pair, plain: Plain, method: str, bit: Status) -> None:
-    """An unusable pixel is NaN with its flag, which no other has; the others keep their values,
-    unless the method looks at neighbours or draws random starts.
-    """
+    """It is NaN with its flag; others keep their values, but beside whole-image methods."""
     whole, result = plain(method), solve(spoilt(pair[0], bit), pair[1], method)
     assert result["status"].values[1, 2] & bit
     for name in schema.STAGES["separated"].keys() - {"status"}:

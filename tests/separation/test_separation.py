@@ -47,9 +47,7 @@ PROTOTYPE = {
 def test_subspace_reaches_the_design(
     pair: tuple[float, float], stop: int, noise_known: bool
 ) -> None:
-    """Object and emissivities are as good as the prototype's, noise known or not; 95 % intervals of
-    the object hold in 92 to 98 % of the samples.
-    """
+    """As good as the prototype, noise known or not; 92 to 98 % of the intervals hold."""
     case = {**GLASS, "emissivity": list(pair), "stop": stop, "noise_known": noise_known}
     scene, result = cases.run_case(case, RIG, TIME, 1600, seed=7)
     score = cases.score(scene, result)
@@ -184,9 +182,7 @@ def coverage(scene: xr.Dataset, result: xr.Dataset) -> np.ndarray:
 def test_no_background_raises_a_false_alarm(
     background: dict[str, Any], stop: int, noise_known: bool
 ) -> None:
-    """92 % of the emissivity's 95 % intervals hold, whatever the background does; fewer than one
-    pixel in 200 of synchronous bands is said to be apart, and fewer than one in 100 to jump.
-    """
+    """92 % of the emissivity's intervals hold; hardly any pixel is apart or jumps."""
     case = {**GLASS, "stop": stop, "background": background, "noise_known": noise_known}
     scene, result = cases.run_case(case, Rig(highest=370.0), TIME, 1000, seed=1)
     share = coverage(scene, result)
@@ -242,9 +238,7 @@ def test_the_flag_grows_with_the_offset() -> None:
 
 
 def test_swapped_roles_are_suspected() -> None:
-    """An object that moves like a background is flagged in 90 % of the pixels, and so are true
-    emissivities of 0.3 and 0.5, whose sum is as small; others are not.
-    """
+    """An object that moves like a background, and emissivities of as small a sum."""
     assert share("roles_may_be_swapped", swapped=True) >= 0.9
     assert share("roles_may_be_swapped", emissivity=[0.3, 0.5]) > 0.9
     assert share("roles_may_be_swapped") < 0.005
@@ -270,9 +264,7 @@ def rms(error: np.ndarray) -> np.ndarray:
 
 
 def test_jump_is_found_and_modelled() -> None:
-    """Nine pixels in ten are as good before and after as nine in ten without a jump, within half
-    and two thirds; they are flagged as jumping, and 95 % intervals hold at the jump itself.
-    """
+    """Before and after nearly as good as without a jump, flagged, intervals hold at it."""
     clean, plain = cases.run_case(TO_50, RIG, TIME, 400, seed=1)
     scene, result = cases.run_case({**TO_50, "jump": SUDDEN}, RIG, TIME, 400, seed=1)
     step = (scene["object_temperature"] - clean["object_temperature"]).values[:, 0]
@@ -516,9 +508,7 @@ def test_two_materials_stay_apart() -> None:
 
 
 def test_reflected_change() -> None:
-    """It is the share of the background's change that the first band sees, for objects that change
-    and for those that do not.
-    """
+    """The share of the background's change in the first band, of any object."""
     rig, value = Rig(noise=(0.003, 0.035)), emissivity_of(0.86, 0.72)
     for stop in (293.15, 303.15):  # a constant object, and one that warms
         rng = np.random.default_rng(4)
