@@ -28,18 +28,10 @@ def fit(name: str, temperature: Floats, counts: Floats, noise: float | None) -> 
     return ""
 
 
-BAD: tuple[str, ...] = (
-    "top",
-    "top, last",
-    "floor",
-    "5 K off",
-    "first off",
-    "last off",
-    "step",
-    "offset",
-    "line",
+BAD = (
+    *("top", "top, last", "floor", "5 K off", "first off", "last off", "step", "offset", "line"),
+    *("root", "log", "exponential", "stefan", "drift", "swapped", "wrapped"),
 )
-BAD += ("root", "log", "exponential", "stefan", "drift", "swapped", "wrapped")
 
 
 def spoilt(bad: str, c: Floats, t: Floats, s: float) -> Floats:
