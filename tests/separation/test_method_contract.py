@@ -63,11 +63,6 @@ def solve(capture: xr.Dataset, response: xr.Dataset, method: str, **options: Any
     return separation.solve(capture, response, methods.get_method(method), **options)
 
 
-def scaled(capture: xr.Dataset, factor: float) -> xr.Dataset:
-    """The capture with its counts multiplied."""
-    return capture.assign(counts=(capture["counts"] * factor).assign_attrs(units="count"))
-
-
 def estimated(result: xr.Dataset) -> set[str]:
     """Names of the values that the method estimates."""
     missing = result.attrs["not_estimated"].split()
@@ -241,7 +236,8 @@ def test_temperature_outside_the_response_is_flagged(
     """A temperature beyond the calibrated range, by five deviations, is flagged or NaN."""
     capture, response = pair
     curve = responses.curve(response, RIG.bands[0])
-    result = solve(scaled(capture, factor), response, method)
+    counts = (capture["counts"] * factor).assign_attrs(units="count")
+    result = solve(capture.assign(counts=counts), response, method)
     flagged = result["status"].values & Status.OUTSIDE_RESPONSE != 0
     for name in FILMS:
         value, margin = result[name].values, 5 * result[f"{name}_std"].fillna(0.0).values
