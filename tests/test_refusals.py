@@ -137,6 +137,9 @@ FALLING = CAPTURE.isel(time=[*range(40), 39, *range(40, 60)])
 TURNED = CAPTURE.transpose("time", "band", "y", "x")
 FIELD = field(np.zeros((2, *SHAPE))).assign_coords(PLACE)
 TWICE = xr.concat([PATCH, PATCH], "patch")
+FLAT = 20000.0 * xr.ones_like(MAPS)
+PLAIN = xr.Dataset({"gain": xr.ones_like(MAPS), "offset": 0.0 * MAPS, "bad": MAPS < 0})
+EVEN = CAPTURE.assign(counts=COUNTS.round().astype(np.uint16))
 CELSIUS = units(OBJECT, "degC")
 SETTINGS: list[tuple[Any, dict[str, Any], str]] = [
     (separation.SubspaceSettings, {"background_drift": None}, "background_drift"),
@@ -323,9 +326,6 @@ def rows(emission: xr.DataArray = OBJECT, change: xr.DataArray = CHANGE) -> Any:
     return figures.separated_frames(*parts, title="plate", labels=labels)
 
 
-FLAT = 20000.0 * xr.ones_like(MAPS)
-PLAIN = xr.Dataset({"gain": xr.ones_like(MAPS), "offset": 0.0 * MAPS, "bad": MAPS < 0})
-EVEN = CAPTURE.assign(counts=COUNTS.round().astype(np.uint16))
 LAID: dict[str, tuple[Callable[[Any], Any], Labelled, str]] = {
     "solve mask of pixels": (lambda it: solve(mask=it), PIXELS, "y x"),
     "solve mask of frames": (lambda it: solve(mask=it), FRAMES, "time"),
