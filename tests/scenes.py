@@ -82,7 +82,6 @@ def walked(
     seed: int,
     emissivity: xr.DataArray,
     temperatures: tuple[float, float, float] = (295.0, 305.0, 333.0),
-    rig: simulation.Rig = RIG,
     background: Callable[[Array, np.random.Generator], Array] | None = None,
 ) -> Scene:
     """Scene of upright people, whose background (time, y, x) [K] may be another."""
@@ -91,7 +90,7 @@ def walked(
     if background is not None:
         cold = truth["background_temperature"]
         truth["background_temperature"] = cold.copy(data=background(cold.values, rng))
-    return observed(truth, rng, rig)
+    return observed(truth, rng)
 
 
 def of_two(*pairs: tuple[float, ...]) -> xr.DataArray:
@@ -393,8 +392,8 @@ def judged(scene: Scene, result: xr.Dataset) -> dict[str, float]:
     Shares [1] of pixels `measured` (no flag, but for frames that are interpolated), `completed`
     and `empty` (without any number). Of those measured: `rmse` of the object, of a `typical` pixel
     (median) [K], `cover` of its 95 % intervals, share `silent` that is off by more than four
-    deviations and 0.3 K, median errors of `emissivity` and `ratio`. Of all pixels:
-    `p90` of their RMSE [K], `whole` cover.
+    deviations and 0.3 K, median error of `emissivity`. Of all pixels: `p90` of their RMSE [K],
+    `whole` cover.
     """
     truth = scene.truth["object_temperature"].values
     error, std = (
@@ -411,11 +410,6 @@ def judged(scene: Scene, result: xr.Dataset) -> dict[str, float]:
         own = xr.broadcast(scene.truth["emissivity"], result["emissivity"])[0]
         own = own.transpose("band", "y", "x").sel(band=result["band"])
         off = np.abs(result["emissivity"].values - own.values)[:, good]
-        first = result.attrs["reference_band"]
-        ratio = ((1.0 - own) / (1.0 - own.sel(band=first))).values
-        of_ratio = np.abs(result["reflection_ratio"].values / ratio - 1.0)[:, good]
-        if "shift" in scene.truth:  # the other band sees another place
-            of_ratio = of_ratio[:0]
         typical = float(np.median(size[good])) if good.any() else np.nan
         return {
             "measured": float(good.mean()),
@@ -426,7 +420,6 @@ def judged(scene: Scene, result: xr.Dataset) -> dict[str, float]:
             "cover": float(held[:, good][there[:, good]].mean()),
             "silent": float(((size > 4.0 * bar) & (size > 0.3))[good].mean()),
             "emissivity": float(np.nanmedian(off, axis=1).max()),
-            "ratio": float(np.nanmedian(of_ratio, axis=1).max()) if of_ratio.size else np.nan,
             "p90": float(np.nanquantile(size, 0.9)),
             "whole": float(held[there].mean()),
         }

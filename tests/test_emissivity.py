@@ -258,10 +258,7 @@ def test_library_mixture_has_the_moments_of_the_libraries(spectra: dict[str, xr.
 
 @pytest.mark.data
 def test_every_spectrum_of_the_libraries(spectra: dict[str, xr.Dataset]) -> None:
-    """All 993 spectra make a table; 224 of them differ by more than 0.05 between the two bands.
-
-    Only six hold values outside [0, 1].
-    """
+    """All 993 make a table, six beyond [0, 1]; 224 differ by 0.05 between the two bands."""
     assert sum(one.attrs["unphysical_values"] > 0 for one in spectra.values()) == 6
     assert min(float(one["wavelength"][-1]) for one in spectra.values()) > 12.39e-6
     made = emissivity.band_table(spectra, FILTERS, minimum_coverage=0.7)

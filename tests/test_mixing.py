@@ -56,10 +56,7 @@ def test_condition_number_against_numpy(first: float, second: float) -> None:
 
 
 def test_extremes_of_the_condition_number() -> None:
-    """A mirror in one band and a blackbody in the other are perfect; gray is singular.
-
-    Plate glass at 0.86 and 0.72 has 9.58.
-    """
+    """A mirror beside a blackbody is perfect, gray is singular, plate glass has 9.58."""
     numbers = mixing.condition_number([[1.0, 0.0], [0.9, 0.9], [0.0, 0.0]])
     np.testing.assert_array_equal(numbers, [1.0, np.inf, np.inf])
     assert float(mixing.condition_number([0.86, 0.72])) == pytest.approx(9.58, abs=0.005)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from captures import emissivity_of
+from scenes import field
 
 from dbthermal import (
     alignment,
@@ -91,7 +92,8 @@ def paired(first: xr.Dataset, second: xr.Dataset) -> xr.Dataset:
 
 def streamed(time: Any, frames: Any = None, segment: Any = 0, **options: Any) -> Any:
     """Frames that a stream takes."""
-    stream = separation.Stream(CAPTURE.isel(time=[0]), CAMERA, frame_rate=10.0, **options)
+    options = {"frame_rate": 10.0} | options
+    stream = separation.Stream(CAPTURE.isel(time=[0]), CAMERA, **options)
     first = CAPTURE["counts"].values[:, 0] if frames is None else frames
     return stream.update(time, first, segment=segment)
 
@@ -111,6 +113,11 @@ def viewed(**changes: Any) -> Call:
     return lambda: separation.solve(CAPTURE, CAMERA.assign(**changes))
 
 
+def displaced(change: Callable[[xr.Dataset], xr.Dataset]) -> Call:
+    """`solve` with a changed field of the reflections' shift."""
+    return lambda: solve(reflection_shift=change(FIELD))
+
+
 def units(array: xr.DataArray, unit: str) -> xr.DataArray:
     """The array in another unit."""
     return array.assign_attrs(units=unit)
@@ -127,6 +134,12 @@ DATES, PATCH = np.datetime64("2026-01-01", "ns") + np.arange(60), PIXELS.expand_
 NEGATIVE = RESULT.assign(object_temperature_std=-RESULT["object_temperature_std"])
 FALLING = CAPTURE.isel(time=[*range(40), 39, *range(40, 60)])
 TURNED = CAPTURE.transpose("time", "band", "y", "x")
+FIELD = field(np.zeros((2, *SHAPE))).assign_coords(PLACE)
+TWICE = xr.concat([PATCH, PATCH], "patch")
+FLAT = 20000.0 * xr.ones_like(MAPS)
+PLAIN = xr.Dataset({"gain": xr.ones_like(MAPS), "offset": 0.0 * MAPS, "bad": MAPS < 0})
+EVEN = CAPTURE.assign(counts=COUNTS.round().astype(np.uint16))
+CELSIUS = units(OBJECT, "degC")
 SETTINGS: list[tuple[Any, dict[str, Any], str]] = [
     (separation.SubspaceSettings, {"background_drift": None}, "background_drift"),
     (separation.SubspaceSettings, {"background_drift": "3"}, "background_drift"),
@@ -166,6 +179,14 @@ CASES: list[tuple[Call, str]] = [
     (lambda: streamed(0.1, KELVIN[:, 0]), "units 'K'"),
     (lambda: streamed(0.1, memory=[10.0]), "memory"),
     (lambda: streamed(0.1, latency=1e9), "latency"),
+    *(
+        (partial(streamed, 0.1, **{name: 0.0}), f"Invalid {name}")
+        for name in ("frame_rate", "latency", "memory", "refresh")
+    ),
+    (
+        lambda: separation.Stream(CAPTURE, CAMERA.drop_vars("noise"), frame_rate=10.0),
+        "Missing noise of the response",
+    ),
     (lambda: paired(STILL, STILL), "Same counts"),
     (lambda: paired(FLAGGED, recorded(1)), "frame_flags"),
     (lambda: mixing.matrix([86.0, 72.0]), "emissivity 86.0"),
@@ -231,6 +252,49 @@ CASES: list[tuple[Call, str]] = [
     (viewed(noise=("band", [1.0, -1.0])), "noise .count. -1.0 in band '9.5'. Must be finite"),
     (viewed(offset=("band", [np.nan, 0.0])), "offset of the response in band '8-14'. Must be fin"),
     *((partial(make, **values), named) for make, values, named in SETTINGS),
+    (displaced(lambda it: it.assign_attrs(reference_band="9.5")), "reference_band .'9.5'. of"),
+    (displaced(lambda it: it.assign_attrs(bands=["3-5"])), "bands .'3-5'. of the reflection shift"),
+    (displaced(lambda it: it.assign_coords(axis=["x", "y"])), "axis .'x', 'y'. of the reflection"),
+    (displaced(lambda it: it.assign(shift=it["shift"] * np.nan)), "without a number"),
+    (displaced(lambda it: it.assign(shift=it["shift"].where(it["x"] > 203))), "where it is known"),
+    (displaced(lambda it: it.assign(shift_std=it["shift_std"] - 1.0)), "Invalid shift_std"),
+    (displaced(lambda it: it.assign(shift=it["shift"] + 30.0)), "shift of 30 pixel. Must be less"),
+    (displaced(lambda it: it.drop_vars("known")), "Missing variable 'known' in the reflection_sh"),
+    (lambda: completed(prior=emissivity_of(1.2, 0.9)), r"emissivities \[1.2, 0.9\] of the prior"),
+    (lambda: completed(prior="glas"), "Unknown prior 'glas'"),
+    (lambda: completed(surroundings=22.0), r"\[K\] 22.0.* not in degrees Celsius"),
+    (lambda: completed(surroundings=2e4), r"surroundings \[K\] 20000.0. Must lie in"),
+    (lambda: completed(surroundings=units(xr.DataArray(22.0), "degC")), "units 'degC' of"),
+    (lambda: completed(surroundings=295.0, surroundings_std=0.0), r"surroundings_std \[K\] 0.0"),
+    (lambda: completed(workers=0), "number of workers 0. Must be a whole number, at least 1"),
+    (lambda: completed(LABELS[:3]), "Invalid size 3 of"),
+    (lambda: separation.materials(RESULT, CAPTURE, CAMERA, error_rate=0.0), r"error_rate 0\.0"),
+    (lambda: separation.materials(RESULT, CAPTURE, CAMERA, resolution=1.5), r"resolution 1\.5"),
+    (
+        lambda: separation.materials(RESULT.drop_vars("reflection_ratio"), CAPTURE, CAMERA),
+        "Missing variable 'reflection_ratio' in the",
+    ),
+    (lambda: separation.materials(RESULT, TURNED, CAMERA), "Invalid dims"),
+    (lambda: correction.Reference(CAMERA, TWICE, (300.0, 300.0)), "Must differ"),
+    (lambda: correction.Reference(CAMERA, TWICE, (300.0,)), r"temperatures \[K\]"),
+    (
+        lambda: correction.correct_capture(
+            EVEN, PLAIN, reference=correction.Reference(CAMERA, TWICE & False, (300.0, 310.0))
+        ),
+        "Invalid patch 0",
+    ),
+    (lambda: reflected_change(APPARENT.isel(band=[1, 0]), RESULT), r"first band '9\.5'. Must be '"),
+    (
+        lambda: figures.separated_temperatures(APPARENT, CELSIUS, CHANGE, title="a"),
+        "Invalid units 'degC' of the emission",
+    ),
+    (lambda: film(CELSIUS), "Invalid units 'degC' of the emission"),
+    (
+        lambda: drawings.scenes.truth_and_estimate(
+            SCENE, RESULT.assign(object_temperature=CELSIUS), (1, 1)
+        ),
+        "Invalid units 'degC' of 'object_temperature' of the result",
+    ),
 ]
 """Call that is refused -> what its message says."""
 
@@ -261,9 +325,6 @@ def rows(emission: xr.DataArray = OBJECT, change: xr.DataArray = CHANGE) -> Any:
     return figures.separated_frames(*parts, title="plate", labels=labels)
 
 
-FLAT = 20000.0 * xr.ones_like(MAPS)
-PLAIN = xr.Dataset({"gain": xr.ones_like(MAPS), "offset": 0.0 * MAPS, "bad": MAPS < 0})
-EVEN = CAPTURE.assign(counts=COUNTS.round().astype(np.uint16))
 LAID: dict[str, tuple[Callable[[Any], Any], Labelled, str]] = {
     "solve mask of pixels": (lambda it: solve(mask=it), PIXELS, "y x"),
     "solve mask of frames": (lambda it: solve(mask=it), FRAMES, "time"),
@@ -275,6 +336,7 @@ LAID: dict[str, tuple[Callable[[Any], Any], Labelled, str]] = {
         MAPS,
         "y x band",
     ),
+    "solve reflection_shift": (lambda it: solve(reflection_shift=it), FIELD, "y x"),
     "solve response": (lambda it: separation.solve(CAPTURE, it), CAMERA, "band"),
     "materials": (lambda it: separation.materials(it, CAPTURE, CAMERA), RESULT, "time y x band"),
     "reflected_change": (lambda it: reflected_change(it, RESULT), APPARENT, "time y x"),
@@ -441,10 +503,17 @@ def test_a_foreign_folder_stays(tmp_path: Path) -> None:
 
 def test_a_wrong_argument_leaves_nothing_of_a_run(tmp_path: Path) -> None:
     """It is refused before anything is made."""
-    wrongs: tuple[dict[str, Any], ...] = ({"seed": "3"}, {"memory": "2e9"}, {"provenance": "x"})
-    for wrong in wrongs:
-        with pytest.raises((TypeError, ValueError), match="Invalid"):
-            separation.run(CAPTURE, tmp_path / "a.zarr", CAMERA, **wrong)
+    wrongs: list[tuple[str, Any, str]] = [
+        ("seed", "3", "Invalid"),
+        ("memory", "2e9", "Invalid"),
+        ("provenance", "x", "Invalid"),
+        ("method", "nonsense", "Must"),
+        ("method", separation.Method(min), "Unknown method Method.* of a run. Must be one of"),
+        ("memory", 1e6, "Invalid memory .* byte. Must be at least .* 60 frames.$"),
+    ]
+    for name, wrong, message in wrongs:
+        with pytest.raises((TypeError, ValueError), match=message):
+            separation.run(CAPTURE, tmp_path / "a.zarr", CAMERA, **{name: wrong})
     assert not list(tmp_path.iterdir())
 
 

@@ -125,12 +125,6 @@ def test_a_film_on_disk_is_an_array_without_a_name(tmp_path: Path) -> None:
     assert film.base is not None
 
 
-def test_a_full_disk_is_an_error(tmp_path: Path) -> None:
-    """A film for which there is no room is refused, and does not end the process when written."""
-    with _arrays.on_disk(tmp_path), pytest.raises(OSError):  # noqa: PT011 - the system's own words
-        _arrays.empty((2**44,), np.float64)
-
-
 def test_pages_are_given_back(tmp_path: Path) -> None:
     """A film of 256 MB that is released part by part takes a fraction of that."""
     with _arrays.on_disk(tmp_path):

@@ -173,10 +173,7 @@ def peak(folder: Path, fitted: xr.Dataset, response: xr.Dataset, options: dict[s
 
 @pytest.mark.bench
 def test_memory_of_long_captures(tmp_path: Path) -> None:
-    """Rows of 640 pixels at 60 Hz for 35 s, cameras apart, from raw counts: at most 6 GB.
-
-    Of these rows; more of them add some 4 kB a pixel.
-    """
+    """Rows of 640 pixels at 60 Hz for 35 s, cameras apart, from raw counts: at most 6 GB."""
     rig: dict[str, Any] = {"shift": (2.4, 1.2), "view": (3, -2), "late": 1, "shutter": (0.4,)}
     options = {**rig, "lost": (0.03, 0.005), "steps": 9, "frames": 16}
     recording = whole.record((48, 640), (2100, 60.0), 1, **options)

@@ -62,10 +62,7 @@ DRIVERS = re.compile(r"dbthermal\.instruments\.(?!protocols|recording|session)")
 
 @pytest.mark.parametrize("name", [name for name in public_functions() if not DRIVERS.match(name)])
 def test_parameters_have_a_section(name: str) -> None:
-    """Parameters, and fields of a record, are listed in the section that the site shows.
-
-    No public function hides its options behind `**options`.
-    """
+    """Parameters and fields are listed in their section; none hides behind `**options`."""
     value = public_functions()[name]
     if inspect.isfunction(value):
         kinds = {parameter.kind for parameter in inspect.signature(value).parameters.values()}

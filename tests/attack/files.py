@@ -173,15 +173,8 @@ def shards(rng: Rng) -> Attack:
 
 _CHARACTERS: Final = "aZ_9.-+() /\\\n\r\x00\x1b\u202e\u00e9\u0301\ud800:*\"'%#~"
 _WORDS: Final = (
-    "counts",
-    "zarr.json",
-    "checksums.sfv",
-    "c/0",
-    "..",
-    "",
-    "__x",
-    "com1.x",
-    "a" * 300,
+    *("counts", "zarr.json", "checksums.sfv", "c/0", ".."),
+    *("", "__x", "com1.x", "a" * 300),
 )
 
 

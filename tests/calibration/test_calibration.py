@@ -237,11 +237,6 @@ def warmer(name: str, by: float = 0.0, units: str = "K") -> Callable[[xr.Dataset
     return lambda it: it.assign({name: (it[name] + by).assign_attrs(units=units)})
 
 
-def equal(it: xr.Dataset) -> xr.Dataset:
-    """The background as warm as the object within 0.3 K."""
-    return it.assign(background_temperature=it["object_temperature"] + 0.3)
-
-
 CASES: list[tuple[Callable[[xr.Dataset], Any], str]] = [
     (lambda it: it.transpose(), "Invalid dims ('measurement', 'band')"),
     (lambda it: it.drop_vars("counts"), "Missing variable 'counts' in the contact"),
@@ -250,7 +245,10 @@ CASES: list[tuple[Callable[[xr.Dataset], Any], str]] = [
     (warmer("object_temperature", units="C"), "Invalid units 'C' of 'object_temperature'"),
     (warmer("object_temperature", 50), "K in band '8-14'. Must lie in the response's range"),
     (warmer("background_temperature", -50), "Invalid background temperature 2"),
-    (equal, "three standard deviations of the difference"),
+    (
+        lambda it: it.assign(background_temperature=it["object_temperature"] + 0.3),
+        "three standard deviations of the difference",
+    ),
     (lambda it: it.assign_coords(band=["8-14", "10.6"]), "Missing band '10.6' in the resp"),
     # Bands with exchanged names give no emissivity, but an error that says what may be wrong.
     (lambda it: it.assign_coords(band=["9.5", "8-14"]), "names or files exchanged"),

@@ -44,20 +44,17 @@ def known() -> xr.Dataset:
     return Rig().response()
 
 
-def measured(of: xr.Dataset, warm: float, foil: float, number: int = 1) -> xr.Dataset:
-    """Measurements without errors of a material in front of one reflected temperature [K]."""
+def measured(of: xr.Dataset, warm: float, foil: float) -> xr.Dataset:
+    """Measurement without errors of a material in front of one reflected temperature [K]."""
     own, reflected = response.counts(of, xr.DataArray([warm, foil], dims="level")).values.T
     films = {"counts": TRUE * own + (1 - TRUE) * reflected, "reflected_counts": reflected}
-    wide = {name: np.repeat(one[:, np.newaxis], number, axis=1) for name, one in films.items()}
-    labelled = {name: (("band", "measurement"), one) for name, one in wide.items()}
-    read = {"object_temperature": ("measurement", np.full(number, warm))}
+    labelled = {name: (("band", "measurement"), one[:, None]) for name, one in films.items()}
+    read = {"object_temperature": ("measurement", [warm])}
     return xr.Dataset(labelled | read, {"band": of["band"].values})
 
 
 def test_deviation_is_the_standards_formula(known: xr.Dataset) -> None:
-    """One exact measurement gives the exact emissivity, and its deviation is
-    sqrt(W^2 + e^2 Wo^2 + (1-e)^2 Wr^2) / |Wo - Wr|.
-    """
+    """An exact measurement: exact, by sqrt(W^2 + e^2 Wo^2 + (1-e)^2 Wr^2) / |Wo - Wr|."""
     found = calibration.reflector_emissivity(measured(known, 325.0, 295.0), known, STDS)
     np.testing.assert_allclose(found["emissivity"], TRUE, rtol=0, atol=1e-12)
     assert np.all(np.isnan(found["reduced_chi2"]))
@@ -109,11 +106,6 @@ def test_both_procedures_are_exact_without_errors(known: xr.Dataset, sample: Sam
 def table(known: xr.Dataset) -> xr.Dataset:
     """Forty series of each object by every procedure."""
     return compare_procedures(known, np.random.default_rng(1), repeats=40)
-
-
-def test_bench_is_within_three_hundredths(table: xr.Dataset) -> None:
-    """Every series of every object on the bench, in both bands, is within 0.03 of its truth."""
-    assert float(table["largest"].sel(procedure="bench").max()) < 0.03
 
 
 def test_bench_s_error_bars_are_true(table: xr.Dataset) -> None:

@@ -109,10 +109,7 @@ def test_every_figure_is_tested() -> None:
 
 @pytest.mark.parametrize("name", DRAWN)
 def test_figure(name: str) -> None:
-    """A figure of measured data is drawn without a warning, has units, and is its caller's.
-
-    The title names simulated data and drawn pictures as such.
-    """
+    """Drawn without a warning, with units, its caller's; the title names simulated data."""
     draw, labels = DRAWN[name]
     check_measured(draw(origin="measured", radiometric=1), {*labels})
     assert "(simulated, not radiometric)" in titles(draw(origin="simulated", radiometric=0))
@@ -188,11 +185,3 @@ def test_colours_are_told_apart_by_the_colour_blind(matrix: str) -> None:
     pairs = combinations(range(len(lab)), 2)
     steps = [float(np.linalg.norm(lab[one] - lab[other])) for one, other in pairs]
     assert min(steps) > 10
-
-
-def test_temperatures_in_another_unit_are_refused() -> None:
-    """Data in degrees Celsius are not drawn as if they were kelvins."""
-    movie = array("time y x", 2, 5, 6).assign_attrs(units="degC")
-    inputs = array("band time y x", 2, 2, 5, 6)
-    with pytest.raises(ValueError, match="Invalid units 'degC' of the emission"):
-        figures.separated_temperatures(inputs, movie, movie, title="scene")

@@ -63,7 +63,6 @@ def stored(path: Path, *frames: Iterable[Frame], telemetry_rows: int = 0) -> xr.
 STANDS = FrameFlag.SEQUENCE_STANDS | FrameFlag.TIME_STANDS | FrameFlag.IMAGE_REPEATED
 OTHER = IMAGE.copy()
 OTHER[-1, -1] += 1
-FOREIGN = FrameFlag.FOREIGN_CLOCK
 RESTARTED = [shot(n, device_time=t, host_time=t + 0.01) for n, t in enumerate((0.04, 0.05))]
 FRAMES: dict[str, tuple[list[Frame], list[int], list[float]]] = {
     # A repeated number or time is flagged, and a restart of the numbers is no loss.
@@ -77,12 +76,6 @@ FRAMES: dict[str, tuple[list[Frame], list[int], list[float]]] = {
         [shot(0), shot(1, device_time=500.0), shot(2), shot(3, device_time=-500.0), shot(4)],
         [0, FrameFlag.TIME_WRONG, 0, FrameFlag.TIME_WRONG, 0],
         [0, math.nan, 0.02, math.nan, 0.04],
-    ),
-    # A camera's own clock has another origin: it is not compared with the host's.
-    "a clock of its own": (
-        [shot(number, device_time=500.0 + number, flags=FOREIGN) for number in range(2)],
-        [FOREIGN, FOREIGN],
-        [math.nan, math.nan],
     ),
     # An unchanged image is flagged and keeps its time; one changed pixel clears the flag.
     "a repeated image": (

@@ -84,9 +84,7 @@ def test_thermocouple_follows_what_it_touches() -> None:
 
 
 def test_truth_lies_beside_the_recordings(tmp_path: Path) -> None:
-    """Truth is opened by name, and cleared with the emulated recordings; a folder with a recording
-    of hardware or a foreign file is not cleared.
-    """
+    """Truth is cleared with emulated recordings, and not beside hardware's or foreign files."""
     emulated.clear(tmp_path / "none")
     for name in ("", "scene.zarr", "notes.txt"):
         folder = tmp_path / f"with {name}"

@@ -134,9 +134,7 @@ def test_values_are_refused(project: Path, text: str, message: str) -> None:
 
 
 def test_values_are_taken_in_order(project: Path) -> None:
-    """A later file's value replaces an earlier one's, and a text replaces both, once; a file of
-    full values that was cut does not leave small ones in a full run.
-    """
+    """Later files and texts replace earlier values; a cut file of full values is refused."""
     files = [project / "a.yaml", project / "b.yaml"]
     files[0].write_text("frames: 4\nrate: 3\nplate: {shape: [], kind: a}")
     files[1].write_text("frames: 5")

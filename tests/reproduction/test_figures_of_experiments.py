@@ -66,18 +66,6 @@ def test_truth_and_estimate_in_celsius() -> None:
         np.testing.assert_allclose(np.asarray(line.get_ydata()), kelvin - 273.15, rtol=0, atol=1e-9)
 
 
-def test_temperatures_in_another_unit_are_refused() -> None:
-    """Data in degrees Celsius are not drawn as if they were kelvins."""
-    movie = array("time y x", 2, 5, 6).assign_attrs(units="degC")
-    inputs = array("band time y x", 2, 2, 5, 6)
-    with pytest.raises(ValueError, match="Invalid units 'degC' of the emission"):
-        next(figures.scenes.separated_film(inputs, movie, movie, title="scene"))
-    scene = separated()
-    celsius = scene.assign(object_temperature=scene["object_temperature"].assign_attrs(units="C"))
-    with pytest.raises(ValueError, match="Invalid units 'C' of 'object_temperature' of the result"):
-        figures.scenes.truth_and_estimate(scene, celsius, (1, 2))
-
-
 def test_nothing_but_nan() -> None:
     """A figure of nothing but NaN is drawn empty and without a warning."""
     for draw in (draw_compared, draw_condition, draw_pooled, draw_truth):
@@ -95,9 +83,7 @@ def test_condition_numbers_of_pairs() -> None:
 
 
 def test_errors_are_in_units_of_their_bound() -> None:
-    """Two bounds, of which one is missing once, and one row of errors above; below an error of 1.2
-    times its bound at 1.2.
-    """
+    """Bounds, one of which is missing once, and errors above; below, errors over bounds."""
     over = {"noise": [0.01, 0.03, 0.1], "case": ["known", "free"]}
     bound = np.array([[1.0, 2.0, 4.0], [0.5, 1.0, 2.0]])
     parts: dict[str, tuple[object, np.ndarray]] = {}

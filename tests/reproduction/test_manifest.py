@@ -143,9 +143,7 @@ def test_mirror(copies: Path) -> None:
 def test_a_mirror_with_a_fault(
     copies: Path, project: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An altered file is named with both checksums, one that is not there is not downloaded, and
-    what is no folder is no mirror.
-    """
+    """Altered files are named with checksums, missing ones not fetched, files no mirror."""
     (copies / "two.txt").write_bytes(b"seconds")
     got, expected = (hashlib.sha256(text).hexdigest() for text in (b"seconds", b"second"))
     for read in (manifest.local, manifest.fetch_collection):
@@ -164,10 +162,7 @@ def test_a_mirror_with_a_fault(
 
 
 def test_download(served: Path, project: Path) -> None:
-    """Without a mirror, `fetch_collection` alone takes files from their origin, once, into data/.
-
-    One with a wrong checksum raises an error and is removed.
-    """
+    """`fetch_collection` alone takes files from their origin, once; altered ones are removed."""
     assert not manifest.available("notes")
     with pytest.raises(FileNotFoundError, match="Missing 2 of 2 files"):
         manifest.local("notes")
@@ -197,9 +192,7 @@ def test_download(served: Path, project: Path) -> None:
 def test_a_download_that_misbehaves(
     served: Path, project: Path, name: str, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A download that is too large, leads to another scheme, or trickles on after the time that its
-    listed size allows, ends and leaves nothing.
-    """
+    """Too large, led to another scheme, or too slow for its size, it leaves nothing."""
     assert served.is_dir()
     monkeypatch.setattr(
         manifest.Collection, "url", lambda self, _: quote(f"{self.origin}{name}", ":/")
@@ -218,10 +211,7 @@ def test_a_download_that_misbehaves(
 def test_main(
     copies: Path, project: Path, capsys: pytest.CaptureFixture[str], folder: bool
 ) -> None:
-    """The command prints a line for a complete collection, and fails for one without a file.
-
-    A mirror may lack an optional collection, but no part of one.
-    """
+    """A line for what is complete; a mirror may lack an optional collection, but no part."""
     assert manifest.main() == 0
     assert re.fullmatch(r"notes: 2 files, 0\.0 MB, in .*notes\n", capsys.readouterr().out)
     (copies / "two.txt").unlink()

@@ -55,9 +55,7 @@ def test_parameters_of_recordings(path: Path) -> None:
 
 @each_notebook
 def test_notebook_is_stored_as_a_question(path: Path) -> None:
-    """The title is a question, one of the last two cells asserts the answer, no outputs and no
-    execution counts are committed, and papermill finds the kernel and the language.
-    """
+    """The title asks, a last cell asserts, outputs are not stored; the kernel is named."""
     title, code = cells(path, "markdown")[0].source.splitlines()[0], cells(path, "code")
     assert title.startswith("# ")
     assert title.endswith("?")
@@ -80,9 +78,7 @@ def test_cells_compose(path: Path) -> None:
 
 
 def test_bookkeeping_is_a_small_share() -> None:
-    """Few code lines are about the paths of inputs and results, beside the parameters, imports,
-    comments and blanks.
-    """
+    """Few code lines beside parameters and imports are about inputs' and results' paths."""
     code = [cell for path in NOTEBOOKS for cell in cells(path, "code")]
     plain = [cell for cell in code if "parameters" not in cell.metadata.get("tags", ())]
     lines = [line.strip() for cell in plain for line in cell.source.splitlines()]

@@ -90,9 +90,7 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_same_run_agrees(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A run agrees with itself, and is known to be one without data; one without numbers is an
-    error, and the command says so.
-    """
+    """A run agrees with itself, as one without data; one without numbers is an error."""
     assert verify.main([]) == 0
     assert capsys.readouterr().out.endswith("3 of 3 numbers agree within 1%, without data\n")
     assert list(json.loads(verify.reference_path().read_text())) == ["without data"]
@@ -115,8 +113,6 @@ def test_same_run_agrees(project: Path, capsys: pytest.CaptureFixture[str]) -> N
     ],
 )
 def test_difference_is_found(project: Path, stem: str, measured: dict[str, Any], code: int) -> None:
-    """Floats agree within 1 %; other, missing and additional numbers do not agree, and a run with
-    data is not compared with the numbers of one without.
-    """
+    """Floats agree within 1 %; other, missing, further and outside data's numbers do not."""
     numbers.save(measured, project / f"results/full/{stem}.json", RECORD)
     assert verify.main([]) == code

@@ -40,9 +40,7 @@ def test_palette_video_gives_positions_and_times(plasma: Path) -> None:
 
 
 def test_masked_palette_video(tmp_path: Path) -> None:
-    """The object's half, in turbo, is valid, the gray half is not, and the printed bar is cut off;
-    a width beyond the video's, another palette than the object's, and no object at all are refused.
-    """
+    """The object's half is valid; wrong widths, palettes, and no object at all are refused."""
     frames = np.full((12, 48, 80, 3), 90, dtype=np.uint8)
     gray = video(tmp_path / "gray.mp4", frames)
     frames[:, :, :32] = coloured(wave(), "turbo")[:, :, :32]

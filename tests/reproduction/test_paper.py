@@ -37,9 +37,7 @@ LOWEST = {"judged": "lowest", "note": "9.5", "labels": ("8.5", "9.5")}
     ],
 )
 def test_verdict(ours: list[float], rule: dict[str, Any], expected: str) -> None:
-    """An error is judged by its size, a value by its distance, of the paper's or of the truth; the
-    method that the paper names must have the lowest error, and two that are alike, be so.
-    """
+    """Errors by size, values by distance, named methods as the lowest, equal ones as alike."""
     numbers = dict(zip("ab", ours, strict=False))
     row = Row("Fig.", "error", STEM, tuple(numbers), published=1.0, unit="K", **rule)
     assert row.verdict({STEM: numbers}) == expected
@@ -54,9 +52,7 @@ def test_half_a_row_is_shown() -> None:
 
 
 def test_everything_published_is_there() -> None:
-    """Ten figures, two tables and each number (10 emissivities, 4 terms, 14 others) have a row,
-    and with the outside data at hand none is left without a number.
-    """
+    """Ten figures, two tables, 28 numbers; with the outside data each has ours beside it."""
     numbers = [part.published for part in paper.rows() if part.published is not None]
     assert len(numbers) == 10 + 4 + 10 + 4
     shown = (0.43, 0.16, 90.10, 56.73, 11.31, 11.64, 63.6, 63.1, 1.72, 5.04, 14.6, 31.68)

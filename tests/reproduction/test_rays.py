@@ -62,9 +62,7 @@ test_no_camera_and_nothing_behind_it = refused(
 
 
 def test_plane_mirrors_as_the_law_says() -> None:
-    """On a plane y turns round and the rest stays, the point is where the ray meets it, and a
-    linear function on the vertices is itself there.
-    """
+    """On a plane y turns round; linear functions on the vertices are themselves there."""
     caster = Caster(wall())
     hits = caster.cast(ORIGINS, DIRECTIONS)
     starts, mirrored = caster.mirrored(hits, DIRECTIONS)
@@ -109,9 +107,7 @@ def test_hidden_points() -> None:
 
 
 def test_concave_surface_sees_itself() -> None:
-    """A ray into a corner of two mirrors meets the second mirror; none of a sphere meets it again,
-    at a silhouette either.
-    """
+    """A ray into a corner meets the second mirror; none of a sphere meets it again."""
     corner = Caster(cast("trimesh.Trimesh", trimesh.util.concatenate([wall(45.0), wall(-45.0)])))
     hits = corner.cast(ORIGINS, DIRECTIONS)
     again = corner.cast(*corner.mirrored(hits, DIRECTIONS))

@@ -40,9 +40,7 @@ def test_parameters_of_the_run(run: Run) -> None:
 
 
 def test_results_lie_under_the_stem(run: Run, tmp_path: Path) -> None:
-    """Datasets, figures, texts and numbers are saved; figures and numbers are handed back. A figure
-    is refused unless each label of an axis with ticks says its unit.
-    """
+    """All is saved; figures and numbers are handed back; labels must say their unit."""
     figure, axes = figures.drawing.canvas(1, 1, (2.0, 2.0))
     run.save(DATASET)
     run.text("# Table", "_table")
@@ -77,10 +75,7 @@ def test_experiment_is_cached(run: Run, tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("run")
 def test_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The folder of the manifest is the root, from below, or from the package's own folder.
-
-    Without a manifest anywhere the error says where it was sought.
-    """
+    """The manifest's folder, from below or the package's; without one the error says where."""
     project = tmp_path.resolve()
     monkeypatch.chdir(tmp_path / "params")
     assert paths.root() == project

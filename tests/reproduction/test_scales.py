@@ -145,9 +145,7 @@ def parts(signal: xr.DataArray) -> xr.Dataset:
 
 
 def test_ratio_and_noise(parts: xr.Dataset) -> None:
-    """The ratio is recovered within 3 %, the ratio of the noises within 5 %, of scaled frames too;
-    pixels with a reflection have its ratio without bias, the others have no correlation.
-    """
+    """The ratio within 3 %, the noises' within 5 %; only reflecting pixels correlate."""
     for attrs in (parts.attrs, uncalibrated.uncalibrated_reflection(movie()).attrs):
         assert attrs["pooled_ratio"] == pytest.approx(RATIO, rel=0.03)
         assert attrs["noise_ratio"] == pytest.approx((NOISE[1] / NOISE[0]) ** 2, rel=0.05)
@@ -161,9 +159,7 @@ def test_ratio_and_noise(parts: xr.Dataset) -> None:
 
 
 def test_reflection_is_the_true_one(signal: xr.DataArray, parts: xr.Dataset) -> None:
-    """Its error is that of the best linear estimate, without the scaling; with the emission it adds
-    up to the first band, to the rounding of float32.
-    """
+    """Its error is the best linear estimate's; with the emission it adds up to the band."""
     total = parts["emission"].astype(float) + parts["reflection"].astype(float)
     np.testing.assert_allclose(total, signal[0], rtol=0, atol=1e-7)
     assert parts["emission"].dtype == parts["reflection"].dtype == np.float32

@@ -93,9 +93,7 @@ def test_bad_pixels_are_counted_by_kind() -> None:
 
 
 def test_ends_of_the_counts() -> None:
-    """A pixel is bad by its RMS error over time, from four deviations on, and not by one frame;
-    with every pixel flagged and NaN the shares are NaN and no pixel is bad.
-    """
+    """A pixel is bad by its RMS error over time; of flagged NaN alone shares are NaN."""
     truth = scene(pixels=5)
     result = normal(truth)
     result[OBJECT] = truth[OBJECT] + 0.399  # K
@@ -146,9 +144,7 @@ def legend(figure: Figure) -> list[str]:
 
 
 def test_status_in_words() -> None:
-    """Each flag that occurs has its colour, its words and its share; others are left out. What is
-    completed is drawn as that, not as good and not as the reason to complete it.
-    """
+    """Each flag that occurs has colour, words and share; completed is drawn as that."""
     figure = drawn([[0, 0, 1, 64], [0, 5, 4, 0]])
     figure.draw_without_rendering()
     image = np.asarray(figure.axes[0].images[0].get_array())

@@ -25,9 +25,7 @@ OPEN = {"plate", "wineglass", "coffee_pot"}
 
 @pytest.mark.parametrize("name", SHAPES)
 def test_topology(name: str) -> None:
-    """A closed shape is a ball with its normals outward; an open one is a disc; no stray vertex;
-    no face is a sliver, poles, seams and corners included: 1 is equilateral, 0 is flat.
-    """
+    """Closed shapes are balls, open ones discs, normals outward, no stray vertex or sliver."""
     mesh = SHAPES[name]()
     assert mesh.is_watertight == (name not in OPEN)
     assert mesh.is_winding_consistent

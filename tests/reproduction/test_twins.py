@@ -39,9 +39,7 @@ def rng(seed: int = 1) -> np.random.Generator:
 
 @pytest.mark.parametrize("name", TWINS)
 def test_scene_is_complete(name: str) -> None:
-    """A scene of the stage `separated`, of temperatures of a room, which a rig can observe; beside
-    the object both temperatures are equal. The same seed gives it, another one other ways.
-    """
+    """A scene of `separated` that a rig observes; the same seed gives it, another others."""
     options = {"spacing": 0.006} if name == "fingerprint" else {}  # m: a coarse mesh is quick
     scene = twins.twin(name, SHORT, rng(), **options)
     for part in (OBJECT, BACKGROUND, "emissivity"):
@@ -81,9 +79,7 @@ def test_nothing_comes_before_the_object(name: str, seed: int) -> None:
 
 
 def test_a_scan_is_stood_on_the_table() -> None:
-    """A rabbit scanned with y up, in millimetres, is 0.15 m high; its z faces the camera, which
-    sees all of it, ears and feet included.
-    """
+    """A rabbit scanned lying, in millimetres, is 0.15 m high, and seen as a whole."""
     upright, seen = bodies.rabbit(), bodies.bunny(SHORT, rng())
     places = seen.camera.project(seen.mesh.vertices)
     assert np.all((places > -0.5) & (places < np.array(seen.camera.shape) - 0.5))
@@ -107,9 +103,7 @@ def test_vessels_peak_where_the_paper_s_did(name: str) -> None:
 
 
 def test_prints_fade() -> None:
-    """A print is warmest when the capture starts, by at least 1 K, and only fades from then on;
-    a person far away moves the plate's background and leaves the print as it is.
-    """
+    """A print only fades from the start; a far person moves the background alone."""
     alone, visited = (
         twins.twin("fingerprint", SLOW, rng(), spacing=0.006, visitor=visitor)
         for visitor in (False, True)

@@ -142,26 +142,6 @@ def test_gaps_of_single_pixels(half: Case) -> None:
     assert held(whole, scene, where=gaps) > 0.9
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"prior": emissivity_of(1.2, 0.9)}, r"Invalid emissivities \[1.2, 0.9\] of the prior"),
-        ({"prior": "glas"}, "Unknown prior 'glas'"),
-        ({"surroundings": 22.0}, r"Invalid surroundings \[K\] 22.0.* not in degrees Celsius"),
-        ({"surroundings": 2e4}, r"Invalid surroundings \[K\] 20000.0. Must lie in"),
-        ({"workers": 0}, "Invalid number of workers 0. Must be a whole number, at least 1"),
-        ({"surroundings": xr.DataArray(22.0, attrs={"units": "degC"})}, "Invalid units 'degC' of"),
-        ({"surroundings": 295.0, "surroundings_std": 0.0}, r"Invalid surroundings_std \[K\] 0.0"),
-        ({"materials": xr.DataArray(np.zeros((3, 4), int), dims=("y", "x"))}, "Invalid size 3 of"),
-    ],
-)
-def test_wrong_knowledge_is_named(half: Case, changes: dict[str, Any], message: str) -> None:
-    """What is stated in another unit, shape or range raises an error that names it."""
-    _, capture, alone = half
-    with pytest.raises(ValueError, match=message):
-        separation.complete(alone, capture, RESPONSE, **changes)
-
-
 def test_result_of_another_capture_is_refused(half: Case) -> None:
     """Values that do not give the signals back are of another capture."""
     _, _, alone = half

@@ -113,22 +113,6 @@ def test_memory_is_the_limit_of_a_process(tmp_path: Path) -> None:
     assert 2e8 < found <= 7e8
 
 
-def test_options_of_pixels_are_cut_into_rows(path: Path, tmp_path: Path) -> None:
-    """A mask, and emissivities, of each pixel are those of its block."""
-    rng, capture = np.random.default_rng(2), store.open_dataset(path)
-    known = xr.DataArray(
-        rng.uniform([[[0.85]], [[0.7]]], [[[0.87]], [[0.73]]], (2, 41, 24)),
-        dims=("band", "y", "x"),
-        coords={"band": list(RIG.bands)},
-    )
-    mask = xr.DataArray(rng.random((41, 24)) < 0.9, dims=("y", "x"))
-    response, target = RIG.response(), tmp_path / "r.zarr"
-    separation.run(path, target, response, "calibrated", memory=MEMORY, emissivity=known, mask=mask)
-    result = store.open_dataset(target)
-    expected = separation.solve(capture.load(), response, "calibrated", emissivity=known, mask=mask)
-    xr.testing.assert_identical(result.load().drop_attrs(), expected.drop_attrs())
-
-
 def test_processes_give_the_same_bytes(path: Path, rest: Path, tmp_path: Path) -> None:
     """Two processes of an executor write the files that one process writes."""
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as two:
@@ -329,20 +313,3 @@ def test_parts_of_another_run_are_refused(path: Path, tmp_path: Path) -> None:
     (parts / "plan.json").write_text("{}")
     with pytest.raises(ValueError, match=r"Invalid folder .*result\.zarr\.parts.*another"):
         separation.run(path, target, RIG.response(), memory=MEMORY, mask=mask)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"method": "nonsense"}, "Must"),
-        ({"method": separation.Method(min)}, "Unknown method Method.* of a run. Must be one of"),
-        ({"memory": 1e6}, "Invalid memory .* byte. Must be at least .* 64 frames.$"),
-    ],
-)
-def test_what_is_of_the_whole_image_is_refused(
-    path: Path, tmp_path: Path, options: dict[str, object], message: str
-) -> None:
-    """Before anything is written."""
-    with pytest.raises(ValueError, match=message):
-        separation.run(path, tmp_path / "r.zarr", RIG.response(), **options)  # type: ignore[arg-type]
-    assert not list(tmp_path.iterdir())

@@ -136,34 +136,6 @@ def test_nothing_stands_where_no_object_fits(wrong: float) -> None:
     assert not bool(result["object_temperature"].where(impossible).notnull().any())
 
 
-FIELD = field(np.zeros((2, *SMALL.shape)))
-BAD = {
-    "size": (FIELD.isel(x=slice(40)), "Invalid size 40 of 'x' of the reflection shift"),
-    "coordinates": (FIELD.assign_coords(x=np.arange(48) + 1.0), "Invalid 'x' of the reflection"),
-    "reference": (FIELD.assign_attrs(reference_band="9.5"), "Invalid reference_band .'9.5'. of"),
-    "bands": (FIELD.assign_attrs(bands=["3-5"]), "Invalid bands .'3-5'. of the reflection shift"),
-    "axis": (FIELD.assign_coords(axis=["x", "y"]), "Invalid axis .'x', 'y'. of the reflection"),
-    "not finite": (FIELD.assign(shift=FIELD["shift"] * np.nan), "without a number"),
-    "part of it": (FIELD.assign(shift=FIELD["shift"].where(FIELD["x"] > 3)), "where it is known"),
-    "std": (FIELD.assign(shift_std=FIELD["shift_std"] - 1.0), "Invalid shift_std"),
-    "large": (FIELD.assign(shift=FIELD["shift"] + 30.0), "reflection shift of 30 pixel. Must be l"),
-    "missing": (FIELD.drop_vars("known"), "Missing variable 'known' in the reflection_shift"),
-}
-
-
-@pytest.mark.parametrize("what", BAD)
-def test_bad_field_is_a_clear_error(what: str) -> None:
-    """A field that is none of this capture is refused, by its name and the rule."""
-    bad, message = BAD[what]
-    rng = np.random.default_rng(1)
-    flat = np.full((TIME.size, *SMALL.shape), 300.0)
-    scene = simulation.scene(TIME, flat, flat, emissivity_of(*GLASS))
-    capture = simulation.observe(scene, RIG.response(), rng)
-    capture = capture.assign_coords(x=np.arange(48.0))
-    with pytest.raises(ValueError, match=message):
-        separation.solve(capture, RIG.response(), reflection_shift=bad)
-
-
 def test_the_quietest_camera_stays_the_reference() -> None:
     """Whatever noise a blur or resampling takes from another band; the field's is the same."""
     shift = smooth_shift((24, 48), 2.5, 0.0)

@@ -142,25 +142,3 @@ def test_ratio_of_a_material_hangs_on_no_reference() -> None:
     off = np.abs(ratios[1] - ratios[0])[1] / std[1]
     print(f"{np.nanquantile(off, (0.5, 0.9))} deviations apart")
     assert np.nanquantile(off, 0.9) < 1.0
-
-
-def test_bad_input_is_a_clear_error(small: Inputs) -> None:
-    """Each error names the thing, the value and the rule."""
-    result, capture, response = small
-    turned = capture.transpose("time", "band", "y", "x")
-    wrong: list[tuple[xr.Dataset, xr.Dataset, dict[str, Any], str]] = [
-        (result, capture, {"error_rate": 0.0}, r"Invalid error_rate 0\.0\. Must lie in"),
-        (result, capture, {"resolution": 1.5}, r"Invalid resolution 1\.5\. Must"),
-        (
-            result.drop_vars("reflection_ratio"),
-            capture,
-            {},
-            "Missing variable 'reflection_ratio' in the",
-        ),
-        (result.isel(band=[1]), capture, {}, "Missing band '8-14' in the result"),
-        (result.isel(x=slice(9)), capture, {}, "size 9 of 'x' of the result. Must be .* 64"),
-        (result, turned, {}, "Invalid dims"),
-    ]
-    for one, other, options, message in wrong:
-        with pytest.raises(ValueError, match=message):
-            materials(one, other, response, **options)

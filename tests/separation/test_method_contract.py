@@ -63,11 +63,6 @@ def solve(capture: xr.Dataset, response: xr.Dataset, method: str, **options: Any
     return separation.solve(capture, response, methods.get_method(method), **options)
 
 
-def scaled(capture: xr.Dataset, factor: float) -> xr.Dataset:
-    """The capture with its counts multiplied."""
-    return capture.assign(counts=(capture["counts"] * factor).assign_attrs(units="count"))
-
-
 def estimated(result: xr.Dataset) -> set[str]:
     """Names of the values that the method estimates."""
     missing = result.attrs["not_estimated"].split()
@@ -82,9 +77,7 @@ def plain(pair: Pair) -> Plain:
 
 @every_method
 def test_result_is_as_the_schema_has_it(pair: Pair, method: str) -> None:
-    """The result satisfies the glossary, and leaves the capture unchanged; what has no value is
-    named in `not_estimated`; a saturated pixel keeps the flag that the correction gave it.
-    """
+    """As in the glossary, with what has no value named; inputs and their flags stay."""
     status = np.zeros((4, 6), dtype=np.uint32)
     status[0, 0] = Status.SATURATED
     capture = pair[0].assign(status=(("y", "x"), status))
@@ -208,9 +201,7 @@ def spoilt(capture: xr.Dataset, bit: Status) -> xr.Dataset:
 @every_method
 @pytest.mark.parametrize("bit", [Status.DEAD_PIXEL, Status.INVALID_SAMPLES, Status.CONSTANT_SIGNAL])
 def test_bad_pixel_is_flagged_and_alone(pair: Pair, plain: Plain, method: str, bit: Status) -> None:
-    """An unusable pixel is NaN with its flag, which no other has; the others keep their values,
-    unless the method looks at neighbours or draws random starts.
-    """
+    """It is NaN with its flag; others keep their values, but beside whole-image methods."""
     whole, result = plain(method), solve(spoilt(pair[0], bit), pair[1], method)
     assert result["status"].values[1, 2] & bit
     for name in schema.STAGES["separated"].keys() - {"status"}:
@@ -245,7 +236,8 @@ def test_temperature_outside_the_response_is_flagged(
     """A temperature beyond the calibrated range, by five deviations, is flagged or NaN."""
     capture, response = pair
     curve = responses.curve(response, RIG.bands[0])
-    result = solve(scaled(capture, factor), response, method)
+    counts = (capture["counts"] * factor).assign_attrs(units="count")
+    result = solve(capture.assign(counts=counts), response, method)
     flagged = result["status"].values & Status.OUTSIDE_RESPONSE != 0
     for name in FILMS:
         value, margin = result[name].values, 5 * result[f"{name}_std"].fillna(0.0).values

@@ -80,9 +80,10 @@ def test_a_capture_on_tensors(case: str, monkeypatch: pytest.MonkeyPatch) -> Non
     np.testing.assert_array_equal(other["status"], one["status"])
     assert int(one["object_temperature"].notnull().any("time").sum()) >= 5
     for name in ("object_temperature", "background_temperature", "emissivity", "reflection_ratio"):
-        value, expected, std = (
-            part.values for part in (other[name], one[name], one[f"{name}_std"])
+        value, expected, std, width = (
+            it[f"{name}{end}"].values for end in ("", "_std") for it in (other, one)
         )
         np.testing.assert_array_equal(np.isfinite(value), np.isfinite(expected))
         error, film = np.abs(value - expected), name.endswith("temperature")
-        assert not np.any(error > ROUNDING * (std + 0.1 * film))
+        assert not np.any(error > ROUNDING * (width + 0.1 * film))
+        np.testing.assert_allclose(std, width, rtol=ROUNDING)

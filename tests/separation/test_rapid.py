@@ -63,10 +63,13 @@ def assert_followed(
     assert min(scored.values()) >= 0.9
 
 
-def test_a_kinked_rise_is_followed() -> None:
+@pytest.mark.parametrize(
+    ("rig", "values"), [(RIG, (0.86, 0.72)), (FOUR, (0.86, 0.72, 0.8, 0.78))], ids=["two", "four"]
+)
+def test_a_kinked_rise_is_followed(rig: simulation.Rig, values: tuple[float, ...]) -> None:
     """A front of kinked rises of 0.3 to 3 s: most pixels without a flag, true intervals."""
     rng = np.random.default_rng(1)
-    assert_followed("kink", heated("kink", rng), rng)
+    assert_followed("kink", heated("kink", rng, emissivity_of(*values, bands=rig.bands)), rng, rig)
 
 
 def test_pieces_are_kept_for_the_next_pass() -> None:
@@ -118,13 +121,6 @@ def test_an_object_that_heats_within_seconds_is_no_parallax(
     result = separation.separate(simulation.observe(scene, RIG.response(), rng), RIG.response())
     assert result.attrs["reflection_shift"] == "none"
     assert "warnings" not in result.attrs
-
-
-def test_a_kinked_rise_is_followed_in_four_bands() -> None:
-    """As of two bands, in the plane in which object and background change all four."""
-    rng = np.random.default_rng(1)
-    values = emissivity_of(0.86, 0.72, 0.8, 0.78, bands=FOUR.bands)
-    assert_followed("kink", heated("kink", rng, values), rng, FOUR)
 
 
 @pytest.mark.long

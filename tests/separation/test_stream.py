@@ -148,17 +148,6 @@ def test_a_bad_frame_is_named(
     assert stream.update(0.1, capture["counts"].values[:, 1]).sizes["time"] == 0
 
 
-def test_a_bad_stream_is_named(glass: Data) -> None:
-    """Numbers that are not positive, and a response without noise, are refused."""
-    _, capture, response = glass
-    for name in ("frame_rate", "latency", "memory", "refresh"):
-        options: dict[str, Any] = {"frame_rate": RATE} | {name: 0.0}
-        with pytest.raises(ValueError, match=name):
-            Stream(capture, response, **options)
-    with pytest.raises(ValueError, match="Missing noise of the response"):
-        Stream(capture, response.drop_vars("noise"), frame_rate=RATE)
-
-
 @pytest.mark.bench
 def test_rate_of_full_frames() -> None:
     """Frames of 640x512 in both bands: processor time of a frame, all rows separated."""

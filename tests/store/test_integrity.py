@@ -70,14 +70,6 @@ def chunks(path: Path) -> list[Path]:
     return [file for file in files(path) if "c" in file.relative_to(path).parts]
 
 
-def flip(file: Path, rng: np.random.Generator) -> None:
-    """Flip one bit."""
-    content = bytearray(file.read_bytes())
-    bit = int(rng.integers(8 * len(content)))
-    content[bit // 8] ^= 1 << bit % 8
-    file.write_bytes(content)
-
-
 def outcome(path: Path, whole: Path, fault: Callable[[Path], Path]) -> str:
     """Result of a fault in a copy of a store: refused by name, harmless, or silent."""
     shutil.copytree(whole, path)
@@ -111,7 +103,10 @@ def test_no_single_fault_is_silent(
 
     def flipped(path: Path) -> Path:
         file = files(path)[rng.integers(len(files(path)))]
-        flip(file, rng)
+        content = bytearray(file.read_bytes())
+        bit = int(rng.integers(8 * len(content)))
+        content[bit // 8] ^= 1 << bit % 8
+        file.write_bytes(content)
         return file
 
     def removed(path: Path) -> Path:

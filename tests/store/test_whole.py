@@ -227,19 +227,3 @@ def test_nothing_behind_a_link_is_removed(tmp_path: Path) -> None:
     (tmp_path / ".a.md.draft" / "mine").mkdir(parents=True)
     store.save_text("a", tmp_path / "a.md", {})
     assert names(tmp_path) == [".a.md.draft", "a.md", "mine"]
-
-
-def test_a_recording_is_not_replaced(tmp_path: Path) -> None:
-    """A second one at its place is refused, while the first is written to and afterwards."""
-    variables = {"counts": ("band", "time", "y", "x")}
-    from dbthermal.schema import Variable  # noqa: PLC0415
-
-    made = {"counts": Variable(variables["counts"], "uint16", "count", "raw counts")}
-    options: dict[str, Any] = {"chunk": 2, "attrs": {}}
-    first = store.Recording(tmp_path / "a.zarr", made, {"y": 3, "x": 4}, ["a"], **options)
-    with pytest.raises(BlockingIOError, match="a recording writes to it"):
-        store.Recording(tmp_path / "a.zarr", made, {"y": 3, "x": 4}, ["a"], **options)
-    assert first.place() == tmp_path / "a.zarr"
-    first.close()
-    with pytest.raises(FileExistsError, match="Must be a new recording"):
-        store.Recording(tmp_path / "a.zarr", made, {"y": 3, "x": 4}, ["a"], **options)
