@@ -64,7 +64,7 @@ from dbthermal.separation._inputs import Method, check_fields
 from dbthermal.separation._quality import status_bits
 from dbthermal.separation._subspace import division, fused, pieces, reflection_ratio
 from dbthermal.separation._subspace.fused import FILMS, Solution
-from dbthermal.separation._tiles import BROKEN, Estimate, Mask, Tile, Whole
+from dbthermal.separation._tiles import BROKEN, NOT_BY_ESTIMATE, Estimate, Mask, Tile, Whole
 
 # Thresholds of the flags, in standard deviations.
 _CONTRAST_SIGMAS: Final = 8.0
@@ -197,7 +197,7 @@ def _report(tile: Tile, solution: Solution) -> Estimate:
     exchanged = (status & np.uint32(Status.ROLES_MAY_BE_SWAPPED)) != 0
     exchanged &= (status & _HARDLY_CHANGES) != 0
     sound = ((status & BROKEN) == 0) & ~exchanged
-    return replace(result, survey=solution.survey(sound, status == 0))
+    return replace(result, survey=solution.survey(sound, (status & NOT_BY_ESTIMATE) == 0))
 
 
 def _flags(tile: Tile, solution: Solution) -> dict[Status, Mask]:
