@@ -22,7 +22,7 @@ BUDGET = {
     "limits": (713, 3),
     "readers": (2663, 10),
     "reporting": (392, 1),
-    "separation": (12863, 54),
+    "separation": (12714, 48),
     "simulation": (563, 2),
     "store": (1376, 6),
 }

@@ -27,7 +27,7 @@ from dbthermal.separation._apart.planes import TAIL, Planes, Scatters
 from dbthermal.separation._apart.relaxation import Floats
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._pooling import pool
-from dbthermal.separation._pooling.ratios import Image
+from dbthermal.separation._pooling.pool import Image
 from dbthermal.separation._quality import Bits
 from dbthermal.separation._subspace.bars import NORMAL95
 from dbthermal.separation._subspace.reflection_ratio import energy_of_variance, principal_ratio

@@ -86,7 +86,7 @@ def fit(measured: Places, asked: Places, cost: Cost, limit: int = DEGREE) -> Gra
     """Gradient at some places from the costs of pixels at known ones, of a degree up to a limit."""
     fits, pixels = [], cost.square.size
     for degree in range(limit + 2):
-        functions = _powers(measured, measured, degree)
+        functions = powers(measured, measured, degree)
         normal = functions.T @ (cost.square[:, np.newaxis] * functions)
         # A degree has at least four pixels to a coefficient.
         scarce = degree > 0 and pixels < _ENOUGH * functions.shape[1]
@@ -111,12 +111,12 @@ def fit(measured: Places, asked: Places, cost: Cost, limit: int = DEGREE) -> Gra
         if gain - terms * (np.log(pixels) if chosen == 0 else 2.0) > highest:
             chosen, highest = degree, gain - 2.0 * terms
     _, _, coefficients, residual = fits[chosen]
-    value = _powers(asked, measured, chosen) @ coefficients
+    value = powers(asked, measured, chosen) @ coefficients
     # A degree more may be there, unseen: beyond the pixels that tell something it matters.
     more = min(chosen + 1, len(fits) - 1) if chosen else 0
     functions, inverse, _, _ = fits[more]
     covariance = _covariance(functions, inverse, variance if chosen else cost.variance)
-    at = _powers(asked, measured, more)
+    at = powers(asked, measured, more)
     left = Left(residual, cost.square, cost.variance)
     side = max(1, round(np.sqrt(_TOGETHER * asked[0].size / pixels)))
     lefts = left, left.over_squares(measured, side)
@@ -151,28 +151,43 @@ def _seen(freedom: int) -> float:
     return float((chdtri(freedom, ndtr(-_SIGMAS)) - freedom) / np.sqrt(2.0 * freedom))
 
 
+def step(
+    places: Places, values: Array, variances: Array, second: Mask, degree: int
+) -> tuple[Array, Array, Array]:
+    r"""Step of values (map, pixel) at the `second` region's border, beside a polynomial.
+
+    By least squares of :math:`f(x, y) = \sum c_{ij} x^i y^j + h [p \in \mathrm{second}]`: of each
+    map the chi-square that is left, :math:`h^2 / \mathrm{var}(h)`, and :math:`1 / \mathrm{std}(h)`.
+    """
+    design = np.append(powers(places, places, degree), second[:, np.newaxis], axis=1)
+    result = []
+    for value, root in zip(values, 1.0 / np.sqrt(variances), strict=True):
+        # design = Q R: h = q^T f / r with q, r the last column and corner, var(h) = 1 / r^2.
+        basis, triangle = np.linalg.qr(root[:, np.newaxis] * design)
+        heights = (root * value) @ basis
+        left = np.sum((root * value) ** 2) - np.sum(heights**2)
+        result.append((left, heights[-1] ** 2, abs(triangle[-1, -1])))
+    left, square, sharpness = np.array(result).T
+    return left, square, sharpness
+
+
 def continuous(places: Places, values: Array, variances: Array, second: Mask, least: Array) -> bool:
     """Say that values (map, pixel) have no step at the border to the `second` region (pixel,)."""
-    roots, lowest, result = 1.0 / np.sqrt(variances), np.inf, False
+    lowest, result = np.inf, False
     for degree in range(_SMOOTH + 1):
-        # A polynomial of the place, without a step at the border and with one.
-        design = np.append(_powers(places, places, degree), second[:, np.newaxis], axis=1)
-        if second.size < _ENOUGH * design.shape[1]:
+        functions = (degree + 1) * (degree + 2) // 2
+        if second.size < _ENOUGH * (functions + 1):
             break
-        left, seen = np.zeros(2), True  # chi-square without a step, and with one
-        for value, root, step in zip(values, roots, least, strict=True):
-            basis, triangle = np.linalg.qr(root[:, np.newaxis] * design)
-            heights = (root * value) @ basis
-            with_step = np.sum((root * value) ** 2) - np.sum(heights**2)
-            left += with_step + np.array([heights[-1] ** 2, 0.0])
-            # The least step (map,) must be one that would be seen at three standard deviations.
-            seen &= step == 0.0 or abs(triangle[-1, -1]) * step > _SIGMAS
-        coefficients = len(values) * (design.shape[1] - 1 + np.arange(2))
-        criteria = left + coefficients * np.log(second.size)
+        left, square, sharpness = step(places, values, variances, second, degree)
+        # The least step (map,) must be one that would be seen at three standard deviations.
+        seen = np.all((least == 0.0) | (sharpness * least > _SIGMAS))
+        chi2 = left.sum() + np.array([square.sum(), 0.0])  # without a step, and with one
+        coefficients = len(values) * (functions + np.arange(2))
+        criteria = chi2 + coefficients * np.log(second.size)
         # The lowest Bayesian information criterion decides, if it leaves no more than noise.
         if criteria.min() < lowest:
             lowest, noise = criteria.min(), chdtri(values.size - coefficients[0], _CHANCE)
-            result = bool(seen and criteria[0] <= criteria[1] and left[0] < noise)
+            result = bool(seen and criteria[0] <= criteria[1] and chi2[0] < noise)
     return result
 
 
@@ -181,7 +196,7 @@ def _covariance(functions: Array, inverse: Array, variance: Array) -> Array:
     return inverse @ (functions.T @ (variance[:, np.newaxis] * functions)) @ inverse
 
 
-def _powers(places: Places, measured: Places, degree: int) -> Array:
+def powers(places: Places, measured: Places, degree: int) -> Array:
     """Products of powers (place, function) of rows and columns, from -1 to 1 at the known ones."""
     # Far from the origin, in pixels, high powers would be alike but for rounding.
     y, x = (
