@@ -88,6 +88,12 @@ class Material(Pixels):
     drift_variance: Array  # its variance from the background's slow part (pixel) [1]
     spread: Array  # variance of single pixels' ratios about these, as `inverse_energy` (pixel)
 
+    @classmethod
+    def of_ratios(cls, ratio: Array, inverse_energy: Array, spread: Array | float = 0.0) -> Self:
+        """Materials without an emissivity."""
+        none, zeros = np.full(ratio.shape[1], np.nan), np.zeros(ratio.shape[1])
+        return cls(ratio, inverse_energy, none, none, none, zeros + spread)
+
 
 @dataclass(frozen=True)
 class Survey(Pixels):

@@ -15,7 +15,7 @@ References
 .. [2] Akaike (1974), IEEE Transactions on Automatic Control 19, 716, doi:10.1109/TAC.1974.1100705
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -27,9 +27,7 @@ from dbthermal._arrays import Array, Mask
 Places = tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]
 """Rows and columns of pixels."""
 
-DEGREE: Final = 4
-"""Highest degree."""
-
+_DEGREE: Final = 4  # highest one
 _ENOUGH: Final = 4  # pixels for each coefficient, at least
 _TOGETHER: Final = 16  # pixels in a square, about, of which the sum is looked at
 # Condition number of the normal equations from which a degree is not determined.
@@ -43,33 +41,24 @@ _TINY: Final = float(np.finfo(np.float64).tiny)
 
 @dataclass(frozen=True)
 class Cost:
-    """Cost of a quantity in each pixel (pixel,), and the variance of its linear coefficient."""
+    """Cost of a quantity in pixels, or in squares of some, and the variance of its linear part."""
 
-    square: Array  # a
-    linear: Array  # b
-    variance: Array  # v
-
-
-@dataclass(frozen=True)
-class Left:
-    """Residual of a polynomial in the costs of pixels, or in their sums over squares (part,)."""
-
-    residual: Array  # of b
-    square: Array  # a
-    variance: Array  # v
+    square: Array  # a (pixel)
+    linear: Array  # b, or what a polynomial leaves of it
+    variance: Array  # v of b
 
     def excess(self, spread: float = 0.0) -> tuple[float, float]:
         """Variance of q that residuals show beyond v, and its deviation at some spread."""
         deviation = np.sqrt(2.0 * np.sum((self.variance + spread * self.square**2) ** 2))
         total = float(np.sum(self.square**2))
-        return float(np.sum(self.residual**2 - self.variance)) / total, float(deviation) / total
+        return float(np.sum(self.linear**2 - self.variance)) / total, float(deviation) / total
 
-    def over_squares(self, places: Places, side: int) -> "Left":
+    def over_squares(self, places: Places, side: int) -> "Cost":
         """Sums over squares of the image with so many pixels along a side."""
         rows, columns = (place // side for place in places)
         group = np.unique(rows * (1 + columns.max()) + columns, return_inverse=True)[1]
-        arrays = self.residual, self.square, self.variance
-        return Left(*(np.bincount(group, array).astype(np.float64) for array in arrays))
+        arrays = self.square, self.linear, self.variance
+        return Cost(*(np.bincount(group, array).astype(np.float64) for array in arrays))
 
 
 @dataclass(frozen=True)
@@ -79,13 +68,13 @@ class Gradient:
     degree: int
     value: Array  # at the places asked for (place,)
     variance: Array  # of it, without a spread (place,)
-    left: tuple[Left, ...]  # in single pixels, and in squares of some
+    left: tuple[Cost, ...]  # in single pixels, and in squares of some
 
 
-def fit(measured: Places, asked: Places, cost: Cost, limit: int = DEGREE) -> Gradient:
-    """Gradient at some places from the costs of pixels at known ones, of a degree up to a limit."""
+def fit(measured: Places, asked: Places, cost: Cost) -> Gradient:
+    """Gradient at some places from the costs of pixels at known ones."""
     fits, pixels = [], cost.square.size
-    for degree in range(limit + 2):
+    for degree in range(_DEGREE + 2):
         functions = powers(measured, measured, degree)
         normal = functions.T @ (cost.square[:, np.newaxis] * functions)
         # A degree has at least four pixels to a coefficient.
@@ -98,12 +87,12 @@ def fit(measured: Places, asked: Places, cost: Cost, limit: int = DEGREE) -> Gra
         fits.append((functions, inverse, coefficients, residual))
     if not fits:  # no pixel tells anything
         nothing, zero = np.full(asked[0].size, np.nan), np.zeros(pixels)
-        return Gradient(0, nothing, nothing, (Left(zero, cost.square, cost.variance),) * 2)
+        return Gradient(0, nothing, nothing, (replace(cost, linear=zero),) * 2)
     # Scatter of pixels beyond the highest degree is no gradient.
     beyond = np.sum(fits[-1][-1] ** 2 - cost.variance) / np.sum(cost.square**2)
     variance = cost.variance + max(float(beyond), 0.0) * cost.square**2
     chosen, highest = 0, 0.0
-    for degree, (functions, inverse, coefficients, _) in enumerate(fits[1 : limit + 1], 1):
+    for degree, (functions, inverse, coefficients, _) in enumerate(fits[1 : _DEGREE + 1], 1):
         # Chi-square of all coefficients but the constant, less the criterion's price.
         covariance = _covariance(functions, inverse, variance)[1:, 1:]
         terms = coefficients[1:].size
@@ -117,7 +106,7 @@ def fit(measured: Places, asked: Places, cost: Cost, limit: int = DEGREE) -> Gra
     functions, inverse, _, _ = fits[more]
     covariance = _covariance(functions, inverse, variance if chosen else cost.variance)
     at = powers(asked, measured, more)
-    left = Left(residual, cost.square, cost.variance)
+    left = replace(cost, linear=residual)
     side = max(1, round(np.sqrt(_TOGETHER * asked[0].size / pixels)))
     lefts = left, left.over_squares(measured, side)
     return Gradient(chosen, value, np.einsum("pi,ij,pj->p", at, covariance, at), lefts)
@@ -129,8 +118,8 @@ def spreads(fits: list[Gradient]) -> list[float]:
     return [max(pair) for pair in zip(*scales, strict=True)]
 
 
-def _spreads(fits: list[Left]) -> list[float]:
-    excesses, sizes = [fit.excess() for fit in fits], [fit.residual.size for fit in fits]
+def _spreads(fits: list[Cost]) -> list[float]:
+    excesses, sizes = [fit.excess() for fit in fits], [fit.linear.size for fit in fits]
     weights = np.array([1.0 / max(deviation, _TINY) ** 2 for _, deviation in excesses])
     usual = float(weights @ [value for value, _ in excesses]) / max(weights.sum(), _TINY)
     if not usual * np.sqrt(weights.sum()) > _seen(sum(sizes)):

@@ -16,7 +16,7 @@ from dbthermal.schema import Status
 from dbthermal.separation._inputs import Inputs, Labels
 from dbthermal.separation._pooling import gradients
 from dbthermal.separation._subspace import reflection_ratio
-from dbthermal.separation._tiles import Array, Mask, Material, Pixels, Survey
+from dbthermal.separation._tiles import Array, Mask, Material, Survey
 
 MOST: Final = 2048
 """Pixels of one material that are surveyed: more would not lower its systematic error."""
@@ -30,6 +30,9 @@ Regroup: TypeAlias = Callable[[Material | None], Labels]
 # Share of a material's pixels with an emissivity alone, from which they tell it for all [1].
 _MOST_TOLD: Final = 0.98
 _ROUNDS: Final = 6  # rounds of leaving out pixels that are not of the material
+# Rounds of a gradient and of the pixels that are not of the material along it: in 22 simulated
+# pictures seven of rising degree are better by 2 % at most, none leaves objects 12 % further off.
+_GRADED: Final = 2
 _INNER: Final = 0.8  # share of its pixels that a ratio needs; by 0.5 objects are 2 % further off
 _MAJORITY: Final = 0.5  # share of pixels with an emissivity alone that speaks for their material
 # Pixels on either side of which a resampled one is made; single ones in a material are no border.
@@ -62,22 +65,11 @@ class Image:
         """Values (..., material) at each pixel (..., pixel); NaN at those without a material."""
         return np.where(self.labels >= 0, values[..., self.labels], np.nan)
 
-    def gradient(
-        self, label: int, known: Labels, cost: gradients.Cost, limit: int = gradients.DEGREE
-    ) -> gradients.Gradient:
+    def gradient(self, label: int, known: Labels, cost: gradients.Cost) -> gradients.Gradient:
         """Gradient at all pixels of a label, from some that are surveyed, see `gradients.fit`."""
         asked = np.flatnonzero(self.labels == label)
         start, places = (np.divmod(pixels, self.width) for pixels in (self.surveyed[known], asked))
-        return gradients.fit(start, places, cost, limit)
-
-
-@dataclass(frozen=True)
-class Common(Pixels):
-    """Ratios of each pixel by its material."""
-
-    ratio: Array  # (band, pixel) [1]
-    variance: Array  # of the ratios, common to neighbours (pixel) [1/K^2]
-    spread: Array  # of single pixels about the ratios (pixel) [1/K^2]
+        return gradients.fit(start, places, cost)
 
 
 def total(labels: Labels, values: Array, count: int) -> Array:
@@ -94,9 +86,9 @@ class Ratios:
     variance: Array  # (material) [1/K^2]
     rapid: Mask  # ratio taken at the largest order, not at the pixels' orders (material)
 
-    def common(self, labels: Labels) -> Common:
+    def common(self, labels: Labels) -> Material:
         """Ratios of pixels by their labels (pixel,)."""
-        return Common(self.ratio[:, labels], self.variance[labels], np.zeros(labels.size))
+        return Material.of_ratios(self.ratio[:, labels], self.variance[labels])
 
 
 def materials(
@@ -171,7 +163,7 @@ def estimate(
             stated = np.isfinite(material.ratio[-1])
             ratio = np.where(stated, material.ratio, image.expand(ratio_set.ratio))
             variance = np.where(stated, material.inverse_energy, image.expand(ratio_set.variance))
-            common = Common(ratio, variance, material.spread)
+            common = Material.of_ratios(ratio, variance, material.spread)
         return _material(image, common, used, survey)
 
 
@@ -261,7 +253,7 @@ def _excess(smaller: tuple[Array, Array], larger: tuple[Array, Array], error: Ar
 
 
 def _outliers(
-    labels: Labels, material: Ratios, common: Common, survey: Survey, noise: Array
+    labels: Labels, material: Ratios, common: Material, survey: Survey, noise: Array
 ) -> Mask:
     """Pixels whose ratio, at the orders of their material, is not the common ratio."""
     rapid = material.rapid[labels]
@@ -288,14 +280,9 @@ def _outliers(
 
 
 def _with_gradients(
-    image: Image,
-    labels: Labels,
-    level: Ratios,
-    survey: Survey,
-    noise: Array,
-    limit: int = gradients.DEGREE,
-) -> tuple[Common, Mask]:
-    r"""Ratios with their gradients, up to a degree, and spreads; materials with either.
+    image: Image, labels: Labels, level: Ratios, survey: Survey, noise: Array
+) -> tuple[Material, Mask]:
+    r"""Ratios with their gradients, and spreads; materials with either.
 
     In the plane of the whitened bands the ratio is the angle :math:`\vartheta` from the common
     axis u towards the axis n across it. A pixel's scatter C of white noise and n degrees of freedom
@@ -318,7 +305,7 @@ def _with_gradients(
         for number, across in enumerate(axes.T[1:], 1):
             square, variances = seen[0, 0] - seen[number, number], seen[0, 0] + frames[pixels]
             cost = gradients.Cost(square, seen[number, 0], variances)
-            gradient = image.gradient(label, pixels, cost, limit)
+            gradient = image.gradient(label, pixels, cost)
             if gradient.degree > 0:
                 vector = vector + gradient.value * across[:, np.newaxis]
                 variance[asked] = np.maximum(variance[asked], length * gradient.variance)
@@ -331,12 +318,12 @@ def _with_gradients(
     ):
         spread[asked] = np.maximum(spread[asked], length * square)
         uneven[label] |= gradient.degree > 0 or square > 0
-    return Common(ratio, variance, spread), uneven
+    return Material.of_ratios(ratio, variance, spread), uneven
 
 
 def _common(
     image: Image, labels: Labels, sound: tuple[Ratios, Labels, Mask], survey: Survey, noise: Array
-) -> tuple[Common, Labels]:
+) -> tuple[Material, Labels]:
     """Ratios of all pixels with their gradients, and labels of the pixels that agree with them."""
     ratio_set, used, most = sound
     # Few pixels with an emissivity alone, a selection by their ratios, tell no gradient.
@@ -344,28 +331,21 @@ def _common(
     common, uneven = _with_gradients(image, seen, ratio_set, survey, noise)
     if not np.any(uneven):
         return common, used
-    common, _ = _with_gradients(image, seen, ratio_set, survey, noise, limit=1)
     # Along a gradient pixels far from its middle are no outliers, and the scatters, which are
-    # added, have one axis only without the gradient. A degree more in each round: pixels near the
-    # middle alone would lead astray beyond it.
-    for degree in range(2, _ROUNDS + 2):
+    # added, have one axis only without the gradient.
+    for _ in range(_GRADED):
         local = common.select_pixels(image.surveyed)
         used = np.where(uneven[labels], labels, used)
-        for _ in range(_ROUNDS):
-            outliers = most & _outliers(used, ratio_set, local, survey, noise)
-            if not np.any(outliers):
-                break
-            used = np.where(outliers, -1, used)
+        used = np.where(most & _outliers(used, ratio_set, local, survey, noise), -1, used)
         change = ratio_set.ratio[:, labels] / local.ratio
         factor = np.where(np.isfinite(change), change, 1.0)
         even = replace(survey, scatter=survey.scatter * factor[:, np.newaxis] * factor)
         ratio_set = _ratios(used, uneven.size - 1, even, noise)
-        seen, limit = np.where(most, used, -1), min(degree, gradients.DEGREE)
-        common, _ = _with_gradients(image, seen, ratio_set, survey, noise, limit)
+        common, _ = _with_gradients(image, np.where(most, used, -1), ratio_set, survey, noise)
     return common, used
 
 
-def _material(image: Image, common: Common, labels: Labels, survey: Survey) -> Material:
+def _material(image: Image, common: Material, labels: Labels, survey: Survey) -> Material:
     """Emissivity of the first band, its variance from noise, and that from drift [1], to ratios."""
     count = int(image.labels.max()) + 1
     # With p = w . kappa of the common ratios, before a background at rest the null combination has
@@ -397,13 +377,11 @@ def _material(image: Image, common: Common, labels: Labels, survey: Survey) -> M
     number = (sums != 0).sum(axis=0)
     clustered = (sums**2).sum(axis=0) / whole**2 * number / np.maximum(number - 1, 1)
     scatter = np.maximum(scatter, clustered)
-    result = Material(
-        ratio=common.ratio,
-        inverse_energy=common.variance,
+    result = replace(
+        common,
         emissivity=image.expand(mean),
         noise_variance=image.expand(np.maximum(scatter, expected)),
         drift_variance=image.expand(total(where, weight * drift, count) / whole),
-        spread=common.spread,
     )
     return _graded(image, result, where, (value - mean[where], noise, weight))
 
