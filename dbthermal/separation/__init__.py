@@ -18,7 +18,7 @@ from dbthermal.separation._solve import METHODS, get_method, solve
 
 if TYPE_CHECKING:
     from dbthermal.separation._calibrated import CalibratedSettings
-    from dbthermal.separation._streaming.stream import Stream
+    from dbthermal.separation._stream import Stream
     from dbthermal.separation._subspace.method import SubspaceSettings
 
 __all__ = [
@@ -40,7 +40,7 @@ __dir__ = __all__.copy
 # These are imported when they are first used: some compile.
 _LATER: Final = {
     "CalibratedSettings": "_calibrated",
-    "Stream": "_streaming.stream",
+    "Stream": "_stream",
     "SubspaceSettings": "_subspace.method",
 }
 

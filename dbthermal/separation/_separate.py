@@ -24,7 +24,7 @@ from dbthermal.separation._apart import displaced
 from dbthermal.separation._blur import equalise, sharpness
 from dbthermal.separation._budget import SKY
 from dbthermal.separation._completion.complete import Beside, filled
-from dbthermal.separation._completion.prior import stated as of_prior
+from dbthermal.separation._completion.scene import stated_prior
 from dbthermal.separation._doubts import against_response, of_one_camera
 from dbthermal.separation._inputs import Inputs, Labels, check, numbered
 from dbthermal.separation._misfit import Misfit
@@ -315,7 +315,7 @@ def check_stated(
         _numbers.real_numbers("surroundings [K]", surroundings, _numbers.KELVIN)
     if prior is None and not FILTERS.keys() >= set(names):
         return False
-    of_prior(prior, names)
+    stated_prior(prior, names)
     return True
 
 

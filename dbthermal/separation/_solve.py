@@ -14,13 +14,12 @@ from tqdm import tqdm
 
 from dbthermal import schema
 from dbthermal._arrays import empty, release, without_blas_threads
-from dbthermal._compiled import compiled
 from dbthermal.separation import _budget as budget
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._apart import side_by_side
 from dbthermal.separation._inputs import Inputs, Method, check
 from dbthermal.separation._pooling import pool as pooling
-from dbthermal.separation._tiles import Estimate, Mask, Material, Survey, Whole
+from dbthermal.separation._tiles import Estimate, Mask, Material, Survey
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance  # settings of a method from outside
@@ -382,24 +381,9 @@ def _write(
                 target[..., places] = values[np.ix_(*[order] * (values.ndim - 1))]
             elif complete and np.all(frames) and np.all(pixels):
                 target[...] = values.reshape(target.shape)
-            else:
-                values, selected = np.asarray(values, np.float32), np.flatnonzero(pixels)
-                _scatter(values, frames, selected, np.divmod(selected, shape[1]), cut.valid, target)
-
-
-@compiled
-def _scatter(
-    values: npt.NDArray[np.float32],
-    frames: Mask,
-    pixels: Whole,
-    places: tuple[Whole, Whole],
-    valid: Mask,
-    film: Any,
-) -> None:
-    """Write values (time, pixel) into a film (time, y, x), NaN at invalid frames and samples."""
-    row, (y, x) = 0, places
-    for t in range(frames.size):
-        for p in range(pixels.size):
-            measured = frames[t] and valid[t, pixels[p]]
-            film[t, y[p], x[p]] = values[row, p] if measured else np.nan
-        row += frames[t]
+            else:  # NaN at frames and samples that are not valid
+                films, selected = np.full(cut.valid.shape, np.nan, np.float32), pixels.nonzero()[0]
+                films = films[:, selected]
+                films[frames] = values
+                films[~cut.valid[:, selected]] = np.nan
+                target[:, *np.divmod(selected, shape[1])] = films

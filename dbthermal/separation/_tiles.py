@@ -90,6 +90,12 @@ class Material(Pixels):
     drift_variance: Array  # its variance from the background's slow part (pixel) [1]
     spread: Array  # variance of single pixels' ratios about these, as `inverse_energy` (pixel)
 
+    @classmethod
+    def of_ratios(cls, ratio: Array, inverse_energy: Array, spread: Array | float = 0.0) -> Self:
+        """Materials without an emissivity."""
+        none, zeros = np.full(ratio.shape[1], np.nan), np.zeros(ratio.shape[1])
+        return cls(ratio, inverse_energy, none, none, none, zeros + spread)
+
 
 @dataclass(frozen=True)
 class Survey(Pixels):
@@ -296,7 +302,7 @@ def cut(
             packed = inputs.division[:, places]
             division = np.unpackbits(packed, axis=0, count=frames).view(bool)
             tile = replace(
-                _tile(inputs, signals, patch, chosen),
+                tile_of(inputs, signals, patch, chosen),
                 surveyed=displacement is None or wanted is not None,
                 gain=gain[1, within] if displacement is not None and method.compiled else None,
                 division=division if packed.any() else None,
@@ -347,7 +353,7 @@ def read(inputs: Inputs, rows: slice) -> tuple[Array, Mask, Mask, Array]:
     # that of a sample [1].
     sets = quality.common_frames(counts, usable, status, inputs.method.minimum_frames)
     frames, pixels = sets[0] if sets else (np.ones(len(usable), dtype=bool), status < 0)
-    signals = _tile(inputs, counts, window, slice(None)).signals
+    signals = tile_of(inputs, counts, window, slice(None)).signals
     signals = signals if frames.all() else signals[:, frames]  # no copy: a row may be large
     return signals, frames, pixels, gain[[0] + [1] * (len(signals) - 1)]
 
@@ -381,7 +387,7 @@ def _sampler(inputs: Inputs, rows: slice) -> Callable[[Window, slice | Whole], d
     return sampled
 
 
-def _tile(inputs: Inputs, counts: Array, window: Window, selected: slice | Whole) -> Tile:
+def tile_of(inputs: Inputs, counts: Array, window: Window, selected: slice | Whole) -> Tile:
     """Tile of counts (band, time, pixel) [count], the quietest band first, of some of a window."""
     bands, place = inputs.bands, (window[0].start, window[1].start)
     curves = tuple(inputs.curves[band] for band in bands)

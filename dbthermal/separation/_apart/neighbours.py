@@ -27,7 +27,7 @@ from dbthermal.separation._apart.planes import TAIL, Planes, Scatters
 from dbthermal.separation._apart.relaxation import Floats
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._pooling import pool
-from dbthermal.separation._pooling.ratios import Image
+from dbthermal.separation._pooling.pool import Image
 from dbthermal.separation._quality import Bits
 from dbthermal.separation._subspace.bars import NORMAL95
 from dbthermal.separation._subspace.reflection_ratio import energy_of_variance, principal_ratio
@@ -86,9 +86,7 @@ def ratios(inputs: Inputs, planes: Planes, status: Bits) -> Material:
     ratio = np.select(cases, [border, ratio, middle], np.nan)
     variance = np.select(cases, [of_border * usual, variance * np.maximum(chi, 1.0), between])
     ratio, variance = (values.reshape(len(noise), -1) for values in (ratio, variance))
-    inverse = energy_of_variance(ratio, variance, noise)
-    none = np.full(status.size, np.nan)
-    return Material(ratio, inverse.mean(axis=0), none, none, none, np.zeros(status.size))
+    return Material.of_ratios(ratio, energy_of_variance(ratio, variance, noise).mean(axis=0))
 
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")

@@ -274,11 +274,16 @@ def _fill(scene: Scene, completed: xr.Dataset, places: Whole, values: Values, so
     order = np.argsort(scene.inputs.bands)  # the capture's
     for name in (*FILMS, *MAPS):
         names = (name, f"{name}_std")
-        new = [values[key][order] if name in MAPS else values[key] for key in names]
-        limits = (curve.lowest, curve.highest) if name == FILMS[0] else (-np.inf, np.inf)
-        films = (completed[key].values for key in names)
-        arrays = (np.asfortranarray(array) for array in new)
-        _take(*films, *arrays, np.stack([y, x], axis=-1), limits, filled, beyond)
+        value, std = (completed[key].values for key in names)
+        new, new_std = (values[key][order] if name in MAPS else values[key] for key in names)
+        free = np.isnan(value[:, y, x]) & np.isfinite(new) & np.isfinite(new_std)
+        t, p = np.nonzero(free)
+        value[t, y[p], x[p]], std[t, y[p], x[p]] = new[free], new_std[free]
+        filled |= free.any(axis=0)
+        # Outside the calibrated range by several deviations.
+        margin = tiles.RANGE_SIGMAS * new_std if name == FILMS[0] else np.inf
+        outside = (new < curve.lowest - margin) | (new > curve.highest + margin)
+        beyond |= (free & outside).any(axis=0)
     if (name := "emissivity_covariance") in completed:
         before, after = completed[name].values[:, :, y, x], values[name][np.ix_(order, order)]
         completed[name].values[:, :, y, x] = np.where(np.isnan(before), after, before)
@@ -288,29 +293,6 @@ def _fill(scene: Scene, completed: xr.Dataset, places: Whole, values: Values, so
     if source in _BITS:
         completed["status"].values[y, x] |= filled * np.uint32(_BITS[source])
     completed["status"].values[y, x] |= beyond * np.uint32(Status.OUTSIDE_RESPONSE)
-
-
-@compiled
-def _take(
-    value: Array,
-    std: Array,
-    new: Array,
-    new_std: Array,
-    places: Whole,
-    limits: tuple[float, float],
-    filled: Mask,
-    beyond: Mask,
-) -> None:
-    """Take new values and deviations (time, pixel) where a film or map has none, in place."""
-    for t in range(len(value)):
-        for p in range(len(places)):
-            place = (t, places[p, 0], places[p, 1])
-            a, b = new[t, p], new_std[t, p]
-            if np.isnan(value[place]) and np.isfinite(a) and np.isfinite(b):
-                value[place], std[place], filled[p] = a, b, True
-                # Outside the limits by several deviations.
-                margin = tiles.RANGE_SIGMAS * b
-                beyond[p] |= a < limits[0] - margin or a > limits[1] + margin
 
 
 def _bridge_rows(completed: xr.Dataset, frames: Mask, lacking: Mask, rows: slice) -> Whole:

@@ -26,12 +26,11 @@ from typing import Final
 import numpy as np
 
 from dbthermal._compiled import compiled
+from dbthermal._smooth import largest
 from dbthermal.separation import _frames as frames
-from dbthermal.separation._completion.curve import Bins, Curve
-from dbthermal.separation._completion.prior import Mixture
 from dbthermal.separation._frames import other_band
 from dbthermal.separation._subspace import kernels
-from dbthermal.separation._tiles import Array, Pixels, Tile, Whole
+from dbthermal.separation._tiles import Array, Mask, Pixels, Tile, Whole
 
 # Probability that the object is farther off than the camera's own reading, at most [1].
 _WORSE: Final = 0.04
@@ -41,6 +40,46 @@ _OTHERWISE: Final = 0.001  # chance that an object itself changes rapidly
 _NEGLIGIBLE: Final = 1e-9  # share of the largest weight
 _BOUNDS: Final = (0.01, 0.999)  # of the emissivities about which the model is linearised
 _VAGUE: Final = 1e6  # where nothing bounds the fluctuation of the background: its variance [K^2]
+# Bins of time, at most, and frames in each, at least.
+_BINS: Final = 32
+_LEAST: Final = 2
+# Nodes of the cubic over a range of [-1, 1], its Chebyshev points; half the range, at least [K].
+_NODES: Final = np.cos(np.pi * (np.arange(4) + 0.5) / 4.0)
+_LEAST_RANGE: Final = 0.5
+# A constant, a quadratic and a cubic, at the nodes: Chebyshev's polynomials.
+_SHAPES: Final = np.cos(np.multiply.outer([0.0, 2.0, 3.0], np.arccos(_NODES)))
+# The first band's change over its noise, in variance, from which a slope is not attenuated.
+_SEEN: Final = 25.0
+# Grid of the first emissivity for a wide prior, finer towards 1; points and reach of a narrow one.
+_GRID: Final = np.concatenate(
+    [np.linspace(0.03, 0.78, 16), np.linspace(0.8, 0.97, 18), np.linspace(0.975, 0.9975, 7)]
+)
+_POINTS: Final = 17
+_SIGMAS: Final = 4.0
+_LIMITS: Final = (0.005, 0.9995)
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """Normal distributions of the emissivities; of more than one component the same everywhere."""
+
+    weight: Array  # (component,)
+    mean: Array  # (component, band, pixel) [1]
+    covariance: Array  # (component, band, band, pixel) [1]
+
+    def grid(self) -> Array:
+        """Grid (grid, pixel) of the first emissivity."""
+        pixels = self.mean.shape[-1]
+        if len(self.weight) > 1:
+            return np.repeat(_GRID[:, np.newaxis], pixels, axis=1)
+        std = np.sqrt(self.covariance[0, 0, 0])
+        low = np.maximum(self.mean[0, 0] - _SIGMAS * std, _LIMITS[0])
+        high = np.minimum(self.mean[0, 0] + _SIGMAS * std, _LIMITS[1])
+        return np.asarray(low + np.linspace(0.0, 1.0, _POINTS)[:, np.newaxis] * (high - low))
+
+    def at(self, places: Whole | int) -> "Mixture":
+        """Return the mixture of some pixels, or of labels (pixel,)."""
+        return Mixture(self.weight, self.mean[..., places], self.covariance[..., places])
 
 
 @dataclass(frozen=True)
@@ -82,6 +121,106 @@ class Moments(Pixels):
         change -= np.eye(len(ratio))[..., np.newaxis]
         change /= dark[0]
         return ratio, np.einsum("imp,mnp,jnp->ijp", change, self.emissivity_covariance, change)
+
+
+@dataclass(frozen=True)
+class Bins:
+    """Means over bins of time."""
+
+    signals: Array  # (band, bin, pixel) [K]
+    frames: Array  # (bin, pixel)
+    time: Array  # (bin) [s]
+
+    def rapid(self, noise: float) -> Array:
+        """Deviation (pixel) [K] of the first band about a smooth curve, less noise; NaN of gaps."""
+        smooth = largest(self.time).functions
+        residual = self.signals[0] - smooth @ (smooth.T @ self.signals[0])
+        variance = (residual**2).sum(axis=0) / (len(smooth) - smooth.shape[1])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            expected = noise**2 * np.mean(1.0 / self.frames, axis=0)
+        return np.sqrt(np.maximum(np.where(np.isinf(expected), np.nan, variance - expected), 0.0))
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Information of the bins on the values at the nodes: log-likelihood -g H g / 2 + h g."""
+
+    nodes: Array  # (node, pixel) [K]
+    information: Array  # H (band - 1, node, node, pixel) [1/K^2]
+    linear: Array  # h (band - 1, node, pixel) [1/K]
+
+
+def bins(tile: Tile, valid: Mask) -> Bins:
+    """Means of the tile's signals over bins of as many frames each."""
+    size = max(_LEAST, -(-tile.time.size // _BINS))
+    starts = np.arange(0, max(tile.time.size - size // 2, 1), size)
+    frames = np.add.reduceat(valid.astype(np.float64), starts, axis=0)
+    total = np.add.reduceat(np.where(valid, tile.signals, 0.0), starts, axis=1)
+    time = np.add.reduceat(tile.time, starts) / np.diff(starts, append=tile.time.size)
+    return Bins(total / np.maximum(frames, 1.0), frames, time)
+
+
+def curve(
+    tile: Tile, means: Bins, offset: Array, stray: Array | float = 0.0, bend: Array | float = 0.0
+) -> Curve:
+    """Other bands over the first, of unknown offsets (band - 1) and bends (band - 1, pixel) [K]."""
+    weight, first = means.frames, means.signals[0]
+    total = np.maximum(weight.sum(axis=0), 1.0)
+    middle = (weight * first).sum(axis=0) / total
+    centred = np.where(weight > 0, first - middle, 0.0)
+    energy = (weight * centred**2).sum(axis=0)
+    bins_used = np.count_nonzero(weight, axis=0)
+    # Strays of the first band [K^2], beside the noise, are not followed by the other bands.
+    centred = centred * (energy > _SEEN * (tile.noise[0] ** 2 * bins_used + stray * total))
+    half = np.maximum(np.abs(centred).max(axis=0), _LEAST_RANGE)
+    base = _lagrange(centred / half)  # (node, bin, pixel)
+    gram = np.einsum("ibp,bp,jbp->ijp", base, weight, base)
+    information, linear = [], []
+    # A slow change of the background bends the bands: it would pass for the bend of the responses,
+    # which is large for a hot metal alone.
+    bends = np.broadcast_to(bend, (len(tile.noise) - 1, total.size))
+    ridge = 1e-9 * total * np.eye(4)[..., np.newaxis]
+    for m in range(1, len(tile.noise)):
+        moment = np.einsum("ibp,bp,bp->ip", base, weight, means.signals[m])
+        fitted = np.linalg.solve(np.moveaxis(gram + ridge, -1, 0), moment.T[..., np.newaxis])
+        residual = means.signals[m] - np.einsum("ibp,pi->bp", base, fitted[..., 0])
+        noise = tile.noise[m] ** 2 + tile.noise[0] ** 2  # of one frame
+        # That of the noise, or the bins' if it is more: there the background fluctuates.
+        variance = _long_run(residual, weight, bins_used, noise)
+        inverse, right = gram / variance, moment / variance
+        # Of a constant, quadratic and cubic part of variance p^2 is told nothing:
+        # H - H b b^T H / (1 / p^2 + b^T H b).
+        deviations = offset[m - 1], bends[m - 1], bends[m - 1]
+        for shape, deviation in zip(_SHAPES, deviations, strict=True):
+            row = np.einsum("ijp,j->ip", inverse, shape)
+            share = deviation**2 / (1.0 + deviation**2 * (shape @ row))
+            right = right - row * (share * (shape @ right))
+            inverse = inverse - share * row[:, np.newaxis] * row
+        information.append(inverse)
+        linear.append(right)
+    nodes = middle + half * _NODES[:, np.newaxis]
+    return Curve(nodes, np.array(information), np.array(linear))
+
+
+def _lagrange(places: Array) -> Array:
+    """Cubics (node, ...) at places in [-1, 1] that are 1 at one of the nodes, 0 at the others."""
+    cubics = []
+    for node in _NODES:
+        roots = _NODES[node != _NODES]
+        cubics.append(np.prod([(places - root) / (node - root) for root in roots], axis=0))
+    return np.asarray(cubics)
+
+
+def _long_run(residual: Array, weight: Array, used: Array, noise: float) -> Array:
+    """Variance (pixel) [K^2] of a frame that gives the bins' scatter, with their correlation."""
+    scaled = np.sqrt(weight) * residual
+    freedom = np.maximum(used - 4, 1)
+    variance = (scaled**2).sum(axis=0) / freedom
+    power = np.maximum((scaled**2).sum(axis=0), np.finfo(np.float64).tiny)
+    lags = [(scaled[lag:] * scaled[:-lag]).sum(axis=0) for lag in (1, 2) if lag < len(scaled)]
+    correlated = 1.0 + 2.0 * np.sum([np.maximum(lag / power, 0.0) for lag in lags], axis=0)
+    more = variance > noise * (1.0 + 3.0 * np.sqrt(2.0 / freedom))
+    return np.asarray(np.where(more, variance * correlated, noise))
 
 
 def moments(tile: Tile, data: Curve, prior: Mixture, level: Level, rapid: Array) -> Moments:

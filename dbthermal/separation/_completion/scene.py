@@ -7,19 +7,16 @@ import numpy as np
 import xarray as xr
 from scipy.special import chdtri
 
-from dbthermal import _numbers, schema
+from dbthermal import _numbers, emissivity, schema
 from dbthermal.noise import MAD
 from dbthermal.schema import Status, laid_on
 from dbthermal.separation import _frames as frames
 from dbthermal.separation import _quality as quality
 from dbthermal.separation import _windows as windows
-from dbthermal.separation._completion import curve as curves
 from dbthermal.separation._completion import posterior
-from dbthermal.separation._completion import prior as priors
-from dbthermal.separation._completion.posterior import Level, Moments
-from dbthermal.separation._completion.prior import Mixture
+from dbthermal.separation._completion.posterior import Level, Mixture, Moments
 from dbthermal.separation._inputs import Inputs
-from dbthermal.separation._tiles import Array, Mask, Tile, Whole
+from dbthermal.separation._tiles import Array, Mask, Tile, Whole, tile_of
 
 FILMS: Final = ("object_temperature", "background_temperature")
 MAPS: Final = ("emissivity", "reflection_ratio")
@@ -47,6 +44,8 @@ _UNUSABLE: Final = np.uint32(Status.CONSTANT_SIGNAL | Status.DEAD_PIXEL)
 # Variance of the median of normal values, relative to that of their mean.
 _MEDIAN: Final = np.pi / 2.0
 _NOTHING: Final = 1e-9  # precision of a level that a pixel does not show [1/K^2]
+# Deviation of the emissivity of one sample of a material from that of the table [1].
+_SAMPLE_STD: Final = 0.02
 
 Sample = tuple[Tile, Mask, Whole]  # some pixels, their valid samples and their numbers
 Values = dict[str, Array]  # completed values of some pixels by their names in the stage `separated`
@@ -75,22 +74,12 @@ class Scene:
 
     def tile(self, block: xr.Dataset, selected: Mask | slice = slice(None)) -> tuple[Tile, Mask]:
         """Tile of the selected pixels of a part of the capture, and valid samples (time, pixel)."""
-        inputs = self.inputs
         counts, valid, status = quality.read(block, most_missing=1.0)
-        valid = valid & ((status & _UNUSABLE) == 0)
-        counts, valid = counts[..., selected], valid[:, selected]
-        curves = tuple(inputs.curves[band] for band in inputs.bands)
-        pairs = zip(inputs.bands, curves, strict=True)
-        signals = [curve.linearise(counts[band]) - curve.reference for band, curve in pairs]
-        return Tile(
-            signals=np.where(valid, signals, 0.0),
-            time=block["time"].values.astype(np.float64),
-            curves=curves,
-            noise=tuple(float(inputs.noise[band]) for band in inputs.bands),
-            shape=(1, valid.shape[1]),
-            rng=np.random.default_rng(0),
-            pattern=tuple(inputs.pattern[inputs.bands]),
-        ), valid
+        valid = (valid & ((status & _UNUSABLE) == 0))[:, selected]
+        row = slice(0, 1), slice(0, valid.shape[1])
+        tile = tile_of(self.inputs, counts[..., selected], row, slice(None))
+        tile.signals[:, ~valid] = 0.0
+        return tile, valid
 
     def sample(self) -> Sample:
         """Tile of evenly spaced pixels, their valid samples, and their numbers in the image."""
@@ -127,7 +116,7 @@ def gather(inputs: Inputs, result: xr.Dataset, pooled: xr.Dataset, prior: Any) -
         source=source,
         emissivity=value,
         covariance=covariance,
-        general=priors.stated(prior, names),
+        general=stated_prior(prior, names),
         offset=np.hypot(pattern[1:], pattern[0]),
         level=Level(float(curve.signal(_ROOM[0])) - curve.reference, _ROOM[1], _FLUCTUATION),
         apart=inputs.displacement is not None,
@@ -164,6 +153,31 @@ def require_same_capture(scene: Scene, result: xr.Dataset, sample: Sample) -> No
         )
 
 
+def stated_prior(prior: str | xr.DataArray | xr.Dataset | None, bands: list[str]) -> Mixture:
+    """Prior of the libraries, of a material of the table, or of the user; see `complete`."""
+    if prior is None:
+        table = emissivity.library_mixture(bands)
+        parts = (table[name].values[..., np.newaxis] for name in ("mean", "covariance"))
+        return Mixture(table["weight"].values, *parts)
+    if isinstance(prior, str):
+        known = emissivity.embedded_table()["emissivity"]
+        if prior not in known["material"]:
+            names = known["material"].values.tolist()
+            raise ValueError(f"Unknown prior '{prior}'. Must be one of {names}.")
+        prior = known.sel(material=prior)
+    stds = np.full(len(bands), _SAMPLE_STD)
+    if isinstance(prior, xr.Dataset):
+        if missing := {"emissivity", "emissivity_std"} - set(prior):
+            raise ValueError(f"Missing variable '{min(missing)}' in the prior. Has {list(prior)}.")
+        prior, std = prior["emissivity"], prior["emissivity_std"]
+        stds = schema.band_values(std, bands, "emissivity_std of the prior", "1")
+    values = schema.band_values(prior, bands, "prior", "1")
+    for name, part in (("emissivities", values), ("emissivity_std", stds)):
+        if not np.all((part > 0) & (part < 1)):
+            raise ValueError(f"Invalid {name} {part.tolist()} of the prior. Must lie in (0, 1).")
+    return Mixture(np.ones(1), values[None, :, None], np.diag(stds**2)[None, ..., None])
+
+
 def stated(scene: Scene, surroundings: float | xr.DataArray, std: float) -> Level:
     """Level of stated surroundings, of all pixels or of each."""
     prior = schema.check_numbers(xr.DataArray(surroundings), "surroundings", "K")
@@ -184,7 +198,7 @@ def solve_statics(
     """Posterior of what is constant in pixels of one source, and background variance [K^2]."""
     with np.errstate(all="ignore"):
         level = scene.level.at(places)
-        means = curves.bins(tile, valid)
+        means = posterior.bins(tile, valid)
         prior = scene.mixture(source, places)
         # Of cameras apart, what the first band shows of its own background is no emission.
         stray = (1.0 - prior.weight @ prior.mean[:, 0]) * level.fluctuation * scene.apart
@@ -192,7 +206,7 @@ def solve_statics(
         factor = 1.0 if scene.apart else prior.mean[:, :1]
         bend = np.sqrt(np.tensordot(prior.weight, (1.0 - prior.mean[:, 1:] / factor) ** 2, 1))
         bend = bend * level.fluctuation
-        data = curves.curve(tile, means, scene.offset, stray**2, bend)
+        data = posterior.curve(tile, means, scene.offset, stray**2, bend)
         static = posterior.moments(tile, data, prior, level, means.rapid(tile.noise[0]))
         variance = posterior.fluctuation(tile, static, means, level.fluctuation)
     return static, np.maximum(variance, _LEAST[1] ** 2)
@@ -255,7 +269,7 @@ def find_level(scene: Scene, sample: Sample) -> Level:
         if source != OWN:
             continue
         # Rapid changes that measured pixels mirror: few such pixels say little of other pixels.
-        std = curves.bins(*block).rapid(tile.noise[0]) / (1.0 - scene.emissivity[0, numbers])
+        std = posterior.bins(*block).rapid(tile.noise[0]) / (1.0 - scene.emissivity[0, numbers])
         if (std := std[scene.measured[numbers] & np.isfinite(std)]).size:
             scatter = _SCATTER / float(np.sqrt(scene.measured.mean()))
             level = replace(scene.level, rapid=float(np.median(std)), scatter=scatter)

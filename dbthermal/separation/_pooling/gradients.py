@@ -15,7 +15,7 @@ References
 .. [2] Akaike (1974), IEEE Transactions on Automatic Control 19, 716, doi:10.1109/TAC.1974.1100705
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -27,9 +27,7 @@ from dbthermal._arrays import Array, Mask
 Places = tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]
 """Rows and columns of pixels."""
 
-DEGREE: Final = 4
-"""Highest degree."""
-
+_DEGREE: Final = 4  # highest one
 _ENOUGH: Final = 4  # pixels for each coefficient, at least
 _TOGETHER: Final = 16  # pixels in a square, about, of which the sum is looked at
 # Condition number of the normal equations from which a degree is not determined.
@@ -43,33 +41,24 @@ _TINY: Final = float(np.finfo(np.float64).tiny)
 
 @dataclass(frozen=True)
 class Cost:
-    """Cost of a quantity in each pixel (pixel,), and the variance of its linear coefficient."""
+    """Cost of a quantity in pixels, or in squares of some, and the variance of its linear part."""
 
-    square: Array  # a
-    linear: Array  # b
-    variance: Array  # v
-
-
-@dataclass(frozen=True)
-class Left:
-    """Residual of a polynomial in the costs of pixels, or in their sums over squares (part,)."""
-
-    residual: Array  # of b
-    square: Array  # a
-    variance: Array  # v
+    square: Array  # a (pixel)
+    linear: Array  # b, or what a polynomial leaves of it
+    variance: Array  # v of b
 
     def excess(self, spread: float = 0.0) -> tuple[float, float]:
         """Variance of q that residuals show beyond v, and its deviation at some spread."""
         deviation = np.sqrt(2.0 * np.sum((self.variance + spread * self.square**2) ** 2))
         total = float(np.sum(self.square**2))
-        return float(np.sum(self.residual**2 - self.variance)) / total, float(deviation) / total
+        return float(np.sum(self.linear**2 - self.variance)) / total, float(deviation) / total
 
-    def over_squares(self, places: Places, side: int) -> "Left":
+    def over_squares(self, places: Places, side: int) -> "Cost":
         """Sums over squares of the image with so many pixels along a side."""
         rows, columns = (place // side for place in places)
         group = np.unique(rows * (1 + columns.max()) + columns, return_inverse=True)[1]
-        arrays = self.residual, self.square, self.variance
-        return Left(*(np.bincount(group, array).astype(np.float64) for array in arrays))
+        arrays = self.square, self.linear, self.variance
+        return Cost(*(np.bincount(group, array).astype(np.float64) for array in arrays))
 
 
 @dataclass(frozen=True)
@@ -79,14 +68,14 @@ class Gradient:
     degree: int
     value: Array  # at the places asked for (place,)
     variance: Array  # of it, without a spread (place,)
-    left: tuple[Left, ...]  # in single pixels, and in squares of some
+    left: tuple[Cost, ...]  # in single pixels, and in squares of some
 
 
-def fit(measured: Places, asked: Places, cost: Cost, limit: int = DEGREE) -> Gradient:
-    """Gradient at some places from the costs of pixels at known ones, of a degree up to a limit."""
+def fit(measured: Places, asked: Places, cost: Cost) -> Gradient:
+    """Gradient at some places from the costs of pixels at known ones."""
     fits, pixels = [], cost.square.size
-    for degree in range(limit + 2):
-        functions = _powers(measured, measured, degree)
+    for degree in range(_DEGREE + 2):
+        functions = powers(measured, measured, degree)
         normal = functions.T @ (cost.square[:, np.newaxis] * functions)
         # A degree has at least four pixels to a coefficient.
         scarce = degree > 0 and pixels < _ENOUGH * functions.shape[1]
@@ -98,12 +87,12 @@ def fit(measured: Places, asked: Places, cost: Cost, limit: int = DEGREE) -> Gra
         fits.append((functions, inverse, coefficients, residual))
     if not fits:  # no pixel tells anything
         nothing, zero = np.full(asked[0].size, np.nan), np.zeros(pixels)
-        return Gradient(0, nothing, nothing, (Left(zero, cost.square, cost.variance),) * 2)
+        return Gradient(0, nothing, nothing, (replace(cost, linear=zero),) * 2)
     # Scatter of pixels beyond the highest degree is no gradient.
     beyond = np.sum(fits[-1][-1] ** 2 - cost.variance) / np.sum(cost.square**2)
     variance = cost.variance + max(float(beyond), 0.0) * cost.square**2
     chosen, highest = 0, 0.0
-    for degree, (functions, inverse, coefficients, _) in enumerate(fits[1 : limit + 1], 1):
+    for degree, (functions, inverse, coefficients, _) in enumerate(fits[1 : _DEGREE + 1], 1):
         # Chi-square of all coefficients but the constant, less the criterion's price.
         covariance = _covariance(functions, inverse, variance)[1:, 1:]
         terms = coefficients[1:].size
@@ -111,13 +100,13 @@ def fit(measured: Places, asked: Places, cost: Cost, limit: int = DEGREE) -> Gra
         if gain - terms * (np.log(pixels) if chosen == 0 else 2.0) > highest:
             chosen, highest = degree, gain - 2.0 * terms
     _, _, coefficients, residual = fits[chosen]
-    value = _powers(asked, measured, chosen) @ coefficients
+    value = powers(asked, measured, chosen) @ coefficients
     # A degree more may be there, unseen: beyond the pixels that tell something it matters.
     more = min(chosen + 1, len(fits) - 1) if chosen else 0
     functions, inverse, _, _ = fits[more]
     covariance = _covariance(functions, inverse, variance if chosen else cost.variance)
-    at = _powers(asked, measured, more)
-    left = Left(residual, cost.square, cost.variance)
+    at = powers(asked, measured, more)
+    left = replace(cost, linear=residual)
     side = max(1, round(np.sqrt(_TOGETHER * asked[0].size / pixels)))
     lefts = left, left.over_squares(measured, side)
     return Gradient(chosen, value, np.einsum("pi,ij,pj->p", at, covariance, at), lefts)
@@ -129,8 +118,8 @@ def spreads(fits: list[Gradient]) -> list[float]:
     return [max(pair) for pair in zip(*scales, strict=True)]
 
 
-def _spreads(fits: list[Left]) -> list[float]:
-    excesses, sizes = [fit.excess() for fit in fits], [fit.residual.size for fit in fits]
+def _spreads(fits: list[Cost]) -> list[float]:
+    excesses, sizes = [fit.excess() for fit in fits], [fit.linear.size for fit in fits]
     weights = np.array([1.0 / max(deviation, _TINY) ** 2 for _, deviation in excesses])
     usual = float(weights @ [value for value, _ in excesses]) / max(weights.sum(), _TINY)
     if not usual * np.sqrt(weights.sum()) > _seen(sum(sizes)):
@@ -151,28 +140,43 @@ def _seen(freedom: int) -> float:
     return float((chdtri(freedom, ndtr(-_SIGMAS)) - freedom) / np.sqrt(2.0 * freedom))
 
 
+def step(
+    places: Places, values: Array, variances: Array, second: Mask, degree: int
+) -> tuple[Array, Array, Array]:
+    r"""Step of values (map, pixel) at the `second` region's border, beside a polynomial.
+
+    By least squares of :math:`f(x, y) = \sum c_{ij} x^i y^j + h [p \in \mathrm{second}]`: of each
+    map the chi-square that is left, :math:`h^2 / \mathrm{var}(h)`, and :math:`1 / \mathrm{std}(h)`.
+    """
+    design = np.append(powers(places, places, degree), second[:, np.newaxis], axis=1)
+    result = []
+    for value, root in zip(values, 1.0 / np.sqrt(variances), strict=True):
+        # design = Q R: h = q^T f / r with q, r the last column and corner, var(h) = 1 / r^2.
+        basis, triangle = np.linalg.qr(root[:, np.newaxis] * design)
+        heights = (root * value) @ basis
+        left = np.sum((root * value) ** 2) - np.sum(heights**2)
+        result.append((left, heights[-1] ** 2, abs(triangle[-1, -1])))
+    left, square, sharpness = np.array(result).T
+    return left, square, sharpness
+
+
 def continuous(places: Places, values: Array, variances: Array, second: Mask, least: Array) -> bool:
     """Say that values (map, pixel) have no step at the border to the `second` region (pixel,)."""
-    roots, lowest, result = 1.0 / np.sqrt(variances), np.inf, False
+    lowest, result = np.inf, False
     for degree in range(_SMOOTH + 1):
-        # A polynomial of the place, without a step at the border and with one.
-        design = np.append(_powers(places, places, degree), second[:, np.newaxis], axis=1)
-        if second.size < _ENOUGH * design.shape[1]:
+        functions = (degree + 1) * (degree + 2) // 2
+        if second.size < _ENOUGH * (functions + 1):
             break
-        left, seen = np.zeros(2), True  # chi-square without a step, and with one
-        for value, root, step in zip(values, roots, least, strict=True):
-            basis, triangle = np.linalg.qr(root[:, np.newaxis] * design)
-            heights = (root * value) @ basis
-            with_step = np.sum((root * value) ** 2) - np.sum(heights**2)
-            left += with_step + np.array([heights[-1] ** 2, 0.0])
-            # The least step (map,) must be one that would be seen at three standard deviations.
-            seen &= step == 0.0 or abs(triangle[-1, -1]) * step > _SIGMAS
-        coefficients = len(values) * (design.shape[1] - 1 + np.arange(2))
-        criteria = left + coefficients * np.log(second.size)
+        left, square, sharpness = step(places, values, variances, second, degree)
+        # The least step (map,) must be one that would be seen at three standard deviations.
+        seen = np.all((least == 0.0) | (sharpness * least > _SIGMAS))
+        chi2 = left.sum() + np.array([square.sum(), 0.0])  # without a step, and with one
+        coefficients = len(values) * (functions + np.arange(2))
+        criteria = chi2 + coefficients * np.log(second.size)
         # The lowest Bayesian information criterion decides, if it leaves no more than noise.
         if criteria.min() < lowest:
             lowest, noise = criteria.min(), chdtri(values.size - coefficients[0], _CHANCE)
-            result = bool(seen and criteria[0] <= criteria[1] and left[0] < noise)
+            result = bool(seen and criteria[0] <= criteria[1] and chi2[0] < noise)
     return result
 
 
@@ -181,7 +185,7 @@ def _covariance(functions: Array, inverse: Array, variance: Array) -> Array:
     return inverse @ (functions.T @ (variance[:, np.newaxis] * functions)) @ inverse
 
 
-def _powers(places: Places, measured: Places, degree: int) -> Array:
+def powers(places: Places, measured: Places, degree: int) -> Array:
     """Products of powers (place, function) of rows and columns, from -1 to 1 at the known ones."""
     # Far from the origin, in pixels, high powers would be alike but for rounding.
     y, x = (

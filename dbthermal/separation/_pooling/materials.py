@@ -31,7 +31,7 @@ from dbthermal import response as responses
 from dbthermal._arrays import Array, Mask
 from dbthermal.schema import Status, laid_on
 from dbthermal.separation._inputs import Labels
-from dbthermal.separation._pooling import feature_maps, region_merging
+from dbthermal.separation._pooling import feature_maps, gradients, region_merging
 from dbthermal.separation._pooling.region_merging import Features, Regions
 from dbthermal.separation._subspace.reflection_ratio import ratio_variance
 from dbthermal.separation._tiles import Material
@@ -49,8 +49,9 @@ _ERROR_RATE, _RESOLUTION = 0.01, 0.1  # of `materials`, unless others are given
 # Step at a border, relative to the change of the reference band's signal, that must be visible
 # before its absence counts [1].
 _LEAST_STEP: Final = 0.05
-# Powers of x and y in the smooth function that a step is distinguished from.
-_POWERS: Final = tuple((i, j) for i in range(4) for j in range(4 - i))
+# Degree of the smooth function that a step is distinguished from; its coefficients and the step's,
+# of which each needs as many pixels; and deviations from which a step is visible.
+_CUBIC, _COEFFICIENTS, _PIXELS, _VISIBLE = 3, 11, 3, 3.0
 # Standard deviation of the ratio, relative to it, that pooling does not reduce [1]: the parts of
 # the object's and the background's curves outside the separator's model.
 _TOLERANCE: Final = 0.0025
@@ -308,46 +309,24 @@ def _links(
     order = np.argsort(cells, axis=None, kind="stable")
     places = np.split(order, np.cumsum(np.bincount(cells.ravel()))[:-1])  # pixels of each cell
     shape = (len(emitted), -1)
-    values, noise, steps = emitted.reshape(shape), variances.reshape(shape), np.empty(len(pairs))
+    values, noise = emitted.reshape(shape), variances.reshape(shape)
+    steps = np.full(len(pairs), np.inf)
     for index, pair in enumerate(pairs):
         first, second = (places[cell] for cell in pair)
         pixels = np.concatenate([first, second])
-        # A border shows in proportion to the object's change: no step is no proof without a change.
+        if pixels.size < _PIXELS * _COEFFICIENTS:
+            continue
+        # A border shows in proportion to the object's change: no step is no proof without a change,
+        # nor where more than noise is left: there the border lies elsewhere than between the cells.
         least = _LEAST_STEP * np.abs(np.mean(change.ravel()[pixels]))
-        where = np.divmod(pixels, cells.shape[1])
-        variance = noise[:, pixels].mean(axis=1)
-        steps[index] = step(where, values[:, pixels], variance, first.size, least)
+        where, second = np.divmod(pixels, cells.shape[1]), np.arange(pixels.size) >= first.size
+        variance = np.repeat(noise[:, pixels].mean(axis=1)[:, np.newaxis], pixels.size, axis=1)
+        left, square, sharpness = gradients.step(where, values[:, pixels], variance, second, _CUBIC)
+        smooth = left <= chdtri(pixels.size - _COEFFICIENTS, _BORDER_RATE)
+        if np.all(smooth & (least * sharpness >= _VISIBLE)):
+            steps[index] = square.sum()
     unbroken = steps < chdtri(len(emitted), _STEP_RATE)
     return pairs[unbroken], steps[unbroken]
-
-
-def step(
-    places: tuple[Labels, Labels], values: Array, variance: Array, first: int, least: float
-) -> float:
-    r"""Significance of a step between two cells, beside a cubic function of the place.
-
-    .. math:: f(x, y) = \sum_{i + j \le 3} c_{ij} x^i y^j + h [p \in \mathrm{second}]
-
-    is fitted by least squares to maps (map, pixel) [K], the first cell's pixels before the
-    second's; :math:`h^2 / \mathrm{var}(h)` is summed over the maps, infinite if no step is told.
-    """
-    pixels = places[0].size
-    y, x = ((place - place.mean()) / _SPACINGS[0] for place in places)
-    second = np.arange(pixels) >= first
-    design = np.stack([*(x**i * y**j for i, j in _POWERS), second], axis=1)
-    if pixels < 3 * design.shape[1]:
-        return np.inf
-    # design = Q R: h = q^T f / r with q, r the last column and corner, var(h) = s^2 / r^2.
-    orthonormal, triangle = np.linalg.qr(design)
-    # Too noisy to show the least step [K] at three standard deviations.
-    if np.any(9.0 * variance > (least * triangle[-1, -1]) ** 2):
-        return np.inf
-    heights = values @ orthonormal
-    residual = np.sum((values - heights @ orthonormal.T) ** 2, axis=1) / variance
-    # More than noise: a border lies elsewhere than between the cells.
-    if np.any(residual > chdtri(pixels - design.shape[1], _BORDER_RATE)):
-        return np.inf
-    return float(np.sum(heights[:, -1] ** 2 / variance))
 
 
 def _labelled(cells: Labels, regions: Regions, result: xr.Dataset) -> xr.DataArray:

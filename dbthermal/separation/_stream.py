@@ -13,16 +13,17 @@ import xarray as xr
 from dbthermal import _numbers, schema
 from dbthermal import response as responses
 from dbthermal.schema import Status
-from dbthermal.separation import _inputs
 from dbthermal.separation import _quality as quality
+from dbthermal.separation import _stream_kernels as kernels
+from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._apart import displaced
+from dbthermal.separation._inputs import Inputs, check
+from dbthermal.separation._quality import Bits
 from dbthermal.separation._solve import require_workers, separated_dataset
-from dbthermal.separation._streaming import kernels
-from dbthermal.separation._streaming.history import History
-from dbthermal.separation._streaming.kernels import Planes
+from dbthermal.separation._stream_kernels import Planes
 from dbthermal.separation._subspace.fused import FILMS
-from dbthermal.separation._subspace.method import METHOD
-from dbthermal.separation._tiles import Array
+from dbthermal.separation._subspace.method import METHOD, separate_smooth
+from dbthermal.separation._tiles import Array, Whole
 
 if TYPE_CHECKING:
     from dbthermal.separation._subspace.method import SubspaceSettings
@@ -32,6 +33,8 @@ _LOST: Final = 1.5  # intervals between frames, from which some are lost
 _GLANCE: Final = 24  # pixels along the shorter side, by which a frame is told from another
 _RATES, _SECONDS = (1e-3, 1e5), (1e-5, 1e3)  # frame rates [Hz] and times [s] that are taken
 _ROWS: Final = 16  # that a thread takes at once
+_SAMPLES: Final = 128  # of the history at most; once reached, half of them at least
+_TOGETHER: Final = 4  # tiles of pixels that a thread separates at once
 
 
 class Stream:
@@ -121,12 +124,12 @@ class Stream:
         options: dict[str, Any] = {"settings": settings, "response_kind": response_kind}
         options["reflection_shift"] = reflection_shift
         options["method"] = replace(METHOD, name="stream", minimum_frames=1, any_bands=False)
-        inputs = _inputs.check(template, response, **options)
+        inputs = check(template, response, **options)
         self.bands = tuple(curve.band for curve in inputs.curves)
         responses.noise(response, list(self.bands))
         # From here on the quietest band is the first one.
         self._order, template = inputs.bands, template.isel(band=inputs.bands)
-        inputs = _inputs.check(template, inputs.response, **options)
+        inputs = check(template, inputs.response, **options)
         self._template, self._kind = template.isel(time=0, drop=True), response_kind
         self._shape = shape = (template.sizes["y"], template.sizes["x"])
         height = shape[0]
@@ -291,7 +294,7 @@ class Stream:
         self._history.add(mean, float(time), self._segment)
         self._blocks += 1
 
-    def _emit(self) -> tuple[Array, Planes, quality.Bits]:
+    def _emit(self) -> tuple[Array, Planes, Bits]:
         """Times, films (film, frame, y, x) and status of the block that has its latency now."""
         slot = (self._blocks - 1 - self._half) % len(self._frames)
         times, means = self._frame_times[slot].copy(), self._mean_times.shape[1]
@@ -302,7 +305,7 @@ class Stream:
         self._apply(partial(self._temperatures, block, fit), self._rows)
         return times, block.films, block.status
 
-    def _as_block(self, slot: int, order: npt.NDArray[np.intp]) -> kernels.Block:
+    def _as_block(self, slot: int, order: Whole) -> kernels.Block:
         """Frames of a slot, the means around the frames, the current maps, and empty films."""
         films = np.empty((4, self._block, *self._shape), np.float32)
         pixels = self._history.maps, self._gain, self._history.status.copy(), films
@@ -320,7 +323,7 @@ class Stream:
         self._temperatures(self._as_block(0, np.arange(1)), fit, slice(0, 0))
         self._history.warm()
 
-    def _dataset(self, times: list[Array], films: list[Planes], status: quality.Bits) -> xr.Dataset:
+    def _dataset(self, times: list[Array], films: list[Planes], status: Bits) -> xr.Dataset:
         """Stage `separated` of the films (film, frame, y, x) at the times, and the maps of now."""
         ratio, variance, *emissivity, a, b, d = self._history.maps
         zero = np.float32(0.0) * ratio
@@ -357,3 +360,100 @@ class Stream:
         unpaired = (np.diff(weights.indptr) == 0).reshape(self._shape)
         self._status |= quality.status_bits({Status.NO_REFLECTION_PAIR: unpaired})
         self._resample = [weights[rows.start * width : rows.stop * width] for rows in self._rows]
+
+
+class History:
+    """Samples of both bands, each a mean of frames, and the maps of each pixel from the samples."""
+
+    def __init__(
+        self, inputs: Inputs, status: Bits, gain: Planes, frames: int, timing: tuple[float, ...]
+    ) -> None:
+        self._inputs, self._status, self._gain, self._frames = inputs, status, gain, frames
+        # Of a mean of so many frames; to be remembered; and of a round through all rows [s].
+        self._length, self._memory, self._round = timing
+        self.samples = np.empty((2, _SAMPLES, *status.shape), np.float32)  # [count]
+        # Ratio, its variance, emissivities and the elements of their covariance.
+        self.maps = np.full((7, *status.shape), np.nan, np.float32)
+        self.status = status | np.uint32(Status.INVALID_SAMPLES)
+        self.solved = False
+        # Times [s] and segments (2, sample); means in a sample, and in the last; next row.
+        self._times = np.empty((2, 0))
+        self._each, self._held, self._next = 1, 1, 0
+
+    def add(self, mean: Planes, time: float, segment: int) -> None:
+        """Take the mean (band, y, x) [count] of the next frames, NaN where a pixel has none."""
+        fresh = self._held == self._each or self._times[1, -1] != segment
+        if fresh and self._times.shape[1] == _SAMPLES:
+            self._make_room()
+        if fresh:
+            self._times = np.column_stack([self._times, (time, segment)])
+            self.samples[:, self._times.shape[1] - 1] = mean
+            self._held = 1
+            return
+        self._held += 1
+        last = self.samples[:, self._times.shape[1] - 1]
+        self._times[0, -1] += (time - self._times[0, -1]) / self._held
+        added = np.where(np.isnan(mean), 0.0, mean - last) / np.float32(self._held)
+        last[...] = np.where(np.isnan(last), mean, last + added)
+
+    def _make_room(self) -> None:
+        """Forget the older half of the samples if the newer is long enough, else join pairs."""
+        half, samples, length = _SAMPLES // 2, self.samples, self._each * self._length
+        if half * length >= self._memory:
+            samples[:, :half], self._times = samples[:, half:], self._times[:, half:]
+            return
+        step = np.diff(self._times, axis=1)[:, ::2]
+        gap = (step[0] > kernels.APART * length) | (step[1] > 0)
+        for i in range(half):
+            earlier, later = samples[:, 2 * i], samples[:, 2 * i + 1]
+            mean = np.where(np.isnan(later), earlier, 0.5 * (earlier + later))
+            samples[:, i] = np.where(gap[i] | np.isnan(earlier), later, mean)
+        self._times = self._times[:, 1::2] - np.where(gap, 0.0, 0.5 * step)
+        self._each *= 2
+
+    def refresh(self, apply: Callable[[Callable[[Any], None], Iterable[Any]], None]) -> None:
+        """Separate the samples of the next rows, so that all rows are done in a round."""
+        complete = self._times.shape[1] - (self._held < self._each)
+        if complete < METHOD.minimum_frames:
+            return
+        height, width = self.status.shape
+        number = int(np.ceil(height * self._length / self._round))
+        stop = min(self._next + number, height)
+        counts = ("band", "time", "y", "x"), self.samples[:, :complete]
+        segment = "time", self._times[1, :complete].astype(np.int32)
+        status = ("y", "x"), self._status
+        inputs = replace(
+            self._inputs,
+            noise=self._inputs.noise / np.sqrt(self._frames * self._each),
+            capture=xr.Dataset(
+                {"counts": counts, "segment": segment, "status": status},
+                {"time": self._times[0, :complete]},
+            ),
+        )
+        tasks = 1 + number * width // (_TOGETHER * tiles.PIXELS)
+        blocks = np.array_split(np.arange(self._next, stop), min(number, tasks))
+        apply(lambda rows: self._separate(inputs, rows), [rows for rows in blocks if rows.size])
+        self._next, self.solved = stop % height, True
+
+    def _separate(self, inputs: Inputs, rows: Whole) -> None:
+        """Maps and status of some rows, as by the method "subspace" without its last step."""
+        for cut in tiles.cut(inputs, slice(rows[0], rows[-1] + 1)):
+            maps = np.full((7, cut.status.size), np.nan, np.float32)
+            second = self._gain[cut.window].ravel().astype(np.float64)
+            for _, pixels, tile in cut.sections:
+                estimate: Any = separate_smooth(replace(tile, gain=second[pixels]), inputs.settings)
+                (a, b), (_, d) = estimate.emissivity_covariance
+                ratio = estimate.reflection_ratio[1], estimate.reflection_ratio_std[1] ** 2
+                maps[:, pixels] = [*ratio, *estimate.emissivity, a, b, d]
+                cut.status[pixels] |= estimate.status
+            shape = self.status[cut.window].shape
+            self.maps[(slice(None), *cut.window)] = maps.reshape(7, *shape)
+            self.status[cut.window] = cut.status.reshape(shape)
+
+    def warm(self) -> None:
+        """Compile the separation, before the first frame comes."""
+        rng, frames = np.random.default_rng(0), METHOD.minimum_frames
+        signals, time = rng.standard_normal((2, frames, 1)), np.arange(1.0 * frames)
+        curves = tuple(self._inputs.curves)
+        tile = tiles.Tile(signals, time, curves, (1.0, 1.0), (1, 1), rng)
+        separate_smooth(tile, self._inputs.settings)

@@ -1,1 +1,0 @@
-"""Separation of frames as they come: the stream, what it remembers, and compiled arithmetic."""
