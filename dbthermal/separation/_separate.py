@@ -24,7 +24,7 @@ from dbthermal.separation._apart import displaced
 from dbthermal.separation._blur import equalise, sharpness
 from dbthermal.separation._budget import SKY
 from dbthermal.separation._completion.complete import Beside, filled
-from dbthermal.separation._completion.scene import stated_prior
+from dbthermal.separation._completion.posterior import Mixture
 from dbthermal.separation._doubts import against_response, of_one_camera
 from dbthermal.separation._inputs import Inputs, Labels, check, numbered
 from dbthermal.separation._misfit import Misfit
@@ -310,13 +310,13 @@ def check_stated(
     names: list[str], workers: int = 1, prior: Any = None, surroundings: Any = None, **_: Any
 ) -> bool:
     """Tell whether a prior knows the bands; ValueError for what is stated and cannot be."""
-    require_workers(workers)
+    completable = prior is not None or FILTERS.keys() >= set(names)
+    if completable:
+        Mixture.of_prior(prior, names)
     if surroundings is not None:
         _numbers.real_numbers("surroundings [K]", surroundings, _numbers.KELVIN)
-    if prior is None and not FILTERS.keys() >= set(names):
-        return False
-    stated_prior(prior, names)
-    return True
+    require_workers(workers)
+    return completable
 
 
 def _over_found_materials(

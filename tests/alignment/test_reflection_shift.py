@@ -241,24 +241,25 @@ def test_refuses_a_shift_beyond_a_third_of_the_image() -> None:
         alignment.reflection_shift(capture, RESPONSE)
 
 
-def test_a_switched_lamp_shows_the_shift() -> None:
+@pytest.mark.parametrize(("shift", "texture"), [(4, 5.0), (12, 3.0)])
+def test_a_switched_lamp_shows_the_shift(shift: int, texture: float) -> None:
     """Its picture is displaced between cameras apart, though it changes everywhere at once."""
     rng, time = np.random.default_rng(1), np.arange(250) / 10.0
-    picture = gaussian_filter(rng.standard_normal((64, 84)), 5.0)
+    picture = gaussian_filter(rng.standard_normal((64, 80 + shift)), texture)
     picture = 7.0 * (picture - picture.min()) / np.ptp(picture)
     lit = np.searchsorted([2.0, 5.0, 9.0, 11.0, 16.0, 20.0], time)[:, np.newaxis, np.newaxis] % 2
     rise = 15.0 * (1.0 - np.exp(-time / 12.0))[:, np.newaxis, np.newaxis]
     warm = np.broadcast_to(300.0 + rise, (250, 64, 80))
     plastic = GLASS.copy(data=[0.6, 0.7])
     scene = simulation.scene(time, warm, warm, plastic)
-    lamps = [295.0 + lit * view for view in (picture[:, :80], picture[:, 4:])]
+    lamps = [295.0 + lit * view for view in (picture[:, :80], picture[:, shift:])]
     dims = ("band", *scene["object_temperature"].dims)
     scene["background_temperature"] = dims, np.array(lamps), {"units": "K"}
     response = simulation.Rig(noise=(0.03, 0.08)).response()
     capture = simulation.observe(scene, response, rng)
     field = alignment.reflection_shift(capture, response)
-    error, _ = errors(field, np.full((2, 64, 80), [[[0.0]], [[4.0]]]))
-    assert error.shape[1] > 0.9 * picture[:, :80].size
+    error, _ = errors(field, np.full((2, 64, 80), [[[0.0]], [[float(shift)]]]))
+    assert error.shape[1] > 0.95 * 64 * (80 - shift)  # of the pixels that have a pair
     assert np.median(np.abs(error), axis=1).max() < 0.05
     assert separation.separate(capture, response).attrs["reflection_shift"] == "found"
 

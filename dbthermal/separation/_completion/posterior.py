@@ -24,7 +24,9 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+import xarray as xr
 
+from dbthermal import emissivity, schema
 from dbthermal._compiled import compiled
 from dbthermal._smooth import largest
 from dbthermal.separation import _frames as frames
@@ -32,6 +34,8 @@ from dbthermal.separation._frames import other_band
 from dbthermal.separation._subspace import kernels
 from dbthermal.separation._tiles import Array, Mask, Pixels, Tile, Whole
 
+# Deviation of the emissivity of one sample of a material from that of the table [1].
+_SAMPLE_STD: Final = 0.02
 # Probability that the object is farther off than the camera's own reading, at most [1].
 _WORSE: Final = 0.04
 # Steps of Gauss-Newton, at most, and the change of the level over its deviation that ends them [1].
@@ -66,6 +70,35 @@ class Mixture:
     weight: Array  # (component,)
     mean: Array  # (component, band, pixel) [1]
     covariance: Array  # (component, band, band, pixel) [1]
+
+    @classmethod
+    def of_prior(cls, prior: str | xr.DataArray | xr.Dataset | None, bands: list[str]) -> "Mixture":
+        """Prior of the libraries, of a material of the table, or of the user; see `complete`."""
+        if prior is None:
+            table = emissivity.library_mixture(bands)
+            parts = (table[name].values[..., np.newaxis] for name in ("mean", "covariance"))
+            return cls(table["weight"].values, *parts)
+        if isinstance(prior, str):
+            known = emissivity.embedded_table()["emissivity"]
+            if prior not in known["material"]:
+                names = known["material"].values.tolist()
+                raise ValueError(f"Unknown prior '{prior}'. Must be one of {names}.")
+            prior = known.sel(material=prior)
+        stds = np.full(len(bands), _SAMPLE_STD)
+        if isinstance(prior, xr.Dataset):
+            if missing := {"emissivity", "emissivity_std"} - set(prior):
+                raise ValueError(
+                    f"Missing variable '{min(missing)}' in the prior. Has {list(prior)}."
+                )
+            prior, std = prior["emissivity"], prior["emissivity_std"]
+            stds = schema.band_values(std, bands, "emissivity_std of the prior", "1")
+        values = schema.band_values(prior, bands, "prior", "1")
+        for name, part in (("emissivities", values), ("emissivity_std", stds)):
+            if not np.all((part > 0) & (part < 1)):
+                raise ValueError(
+                    f"Invalid {name} {part.tolist()} of the prior. Must lie in (0, 1)."
+                )
+        return cls(np.ones(1), values[None, :, None], np.diag(stds**2)[None, ..., None])
 
     def grid(self) -> Array:
         """Grid (grid, pixel) of the first emissivity."""

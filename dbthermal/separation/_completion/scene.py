@@ -7,7 +7,7 @@ import numpy as np
 import xarray as xr
 from scipy.special import chdtri
 
-from dbthermal import _numbers, emissivity, schema
+from dbthermal import _numbers, schema
 from dbthermal.noise import MAD
 from dbthermal.schema import Status, laid_on
 from dbthermal.separation import _frames as frames
@@ -44,8 +44,6 @@ _UNUSABLE: Final = np.uint32(Status.CONSTANT_SIGNAL | Status.DEAD_PIXEL)
 # Variance of the median of normal values, relative to that of their mean.
 _MEDIAN: Final = np.pi / 2.0
 _NOTHING: Final = 1e-9  # precision of a level that a pixel does not show [1/K^2]
-# Deviation of the emissivity of one sample of a material from that of the table [1].
-_SAMPLE_STD: Final = 0.02
 
 Sample = tuple[Tile, Mask, Whole]  # some pixels, their valid samples and their numbers
 Values = dict[str, Array]  # completed values of some pixels by their names in the stage `separated`
@@ -116,7 +114,7 @@ def gather(inputs: Inputs, result: xr.Dataset, pooled: xr.Dataset, prior: Any) -
         source=source,
         emissivity=value,
         covariance=covariance,
-        general=stated_prior(prior, names),
+        general=Mixture.of_prior(prior, names),
         offset=np.hypot(pattern[1:], pattern[0]),
         level=Level(float(curve.signal(_ROOM[0])) - curve.reference, _ROOM[1], _FLUCTUATION),
         apart=inputs.displacement is not None,
@@ -151,31 +149,6 @@ def require_same_capture(scene: Scene, result: xr.Dataset, sample: Sample) -> No
             f"Invalid result: its values are {np.median(score):.0f} times the noise off the "
             "signals of the capture. Must be of the same capture."
         )
-
-
-def stated_prior(prior: str | xr.DataArray | xr.Dataset | None, bands: list[str]) -> Mixture:
-    """Prior of the libraries, of a material of the table, or of the user; see `complete`."""
-    if prior is None:
-        table = emissivity.library_mixture(bands)
-        parts = (table[name].values[..., np.newaxis] for name in ("mean", "covariance"))
-        return Mixture(table["weight"].values, *parts)
-    if isinstance(prior, str):
-        known = emissivity.embedded_table()["emissivity"]
-        if prior not in known["material"]:
-            names = known["material"].values.tolist()
-            raise ValueError(f"Unknown prior '{prior}'. Must be one of {names}.")
-        prior = known.sel(material=prior)
-    stds = np.full(len(bands), _SAMPLE_STD)
-    if isinstance(prior, xr.Dataset):
-        if missing := {"emissivity", "emissivity_std"} - set(prior):
-            raise ValueError(f"Missing variable '{min(missing)}' in the prior. Has {list(prior)}.")
-        prior, std = prior["emissivity"], prior["emissivity_std"]
-        stds = schema.band_values(std, bands, "emissivity_std of the prior", "1")
-    values = schema.band_values(prior, bands, "prior", "1")
-    for name, part in (("emissivities", values), ("emissivity_std", stds)):
-        if not np.all((part > 0) & (part < 1)):
-            raise ValueError(f"Invalid {name} {part.tolist()} of the prior. Must lie in (0, 1).")
-    return Mixture(np.ones(1), values[None, :, None], np.diag(stds**2)[None, ..., None])
 
 
 def stated(scene: Scene, surroundings: float | xr.DataArray, std: float) -> Level:
