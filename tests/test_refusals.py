@@ -274,6 +274,10 @@ CASES: list[tuple[Call, str]] = [
         lambda: separation.materials(RESULT.drop_vars("reflection_ratio"), CAPTURE, CAMERA),
         "Missing variable 'reflection_ratio' in the",
     ),
+    (
+        lambda: separation.materials(RESULT.isel(band=[1]), CAPTURE, CAMERA),
+        r"Missing band '8-14' in the result, of \['9.5'\]. Must be there",
+    ),
     (lambda: separation.materials(RESULT, TURNED, CAMERA), "Invalid dims"),
     (lambda: correction.Reference(CAMERA, TWICE, (300.0, 300.0)), "Must differ"),
     (lambda: correction.Reference(CAMERA, TWICE, (300.0,)), r"temperatures \[K\]"),
@@ -439,6 +443,23 @@ def test_times_differ_beyond_rounding(here: Any, there: Any, *, same: bool) -> N
     else:
         with pytest.raises(ValueError, match="Invalid 'time' of "):
             laid_on(second, first, "the second", "the first")
+
+
+@pytest.mark.parametrize(
+    "capture", [CAPTURE.where(COUNTS < 0), CAPTURE.where(COUNTS["band"] != "9.5")]
+)
+def test_a_capture_without_samples_is_named(capture: xr.Dataset) -> None:
+    """All pixels are flagged; a mask of everything is said in the same words."""
+    for call in (
+        lambda: separation.separate(capture, CAMERA),
+        lambda: solve(mask=PIXELS & False),
+    ):
+        with pytest.warns(
+            UserWarning, match="Invalid samples in all of 48 pixels.*Must be"
+        ) as notes:
+            result = call()
+        assert np.all(result["status"] == np.uint32(Status.INVALID_SAMPLES))
+        assert str(notes[0].message) in result.attrs["warnings"]
 
 
 def test_a_reference_far_off_is_named() -> None:

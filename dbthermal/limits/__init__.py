@@ -309,7 +309,7 @@ def plan(
         stds = _fisher.deviations(sensitivity, truth.time, order, reference=0)
         # One number for all frames: the root of their mean square. A free background is measured
         # by its frame alone.
-        alone = 0.0, (stride - 1.0) * sensitivity.free
+        alone = 0.0 * sensitivity.free, (stride - 1.0) * sensitivity.free
         for name, variance in zip(_fisher.TEMPERATURES, alone, strict=True):
             stds[name] = np.sqrt(np.mean(stds[name] ** 2 + variance, axis=0))
         stds["condition_number"] = mixing.condition_number(truth.emissivity.T)
@@ -387,10 +387,10 @@ def _designed(design: CaptureDesign, emissivity: Array) -> tuple[_fisher.Truth, 
     changes, rarer = np.count_nonzero(np.diff(pulse)), min(np.bincount(pulse, minlength=2))
     longest = int(2 * _MOVED * rarer / changes) if changes else frames
     step = max(1, min(frames // _RESOLVED, longest))
-    time, rise, pulse = (values[step // 2 :: step] for values in (time, rise, pulse))
+    every = slice(step // 2, None, step)
     films = design.start + design.span * rise, design.level + design.amplitude * pulse, ~pulse
-    x, y, resting = (np.tile(film[:, np.newaxis], emissivity.shape[1]) for film in films)
-    return _fisher.Truth(time, x, y, emissivity, resting), frames / time.size
+    x, y, resting = (np.tile(film[every, np.newaxis], emissivity.shape[1]) for film in films)
+    return _fisher.Truth(time[every], x, y, emissivity, resting), frames / time[every].size
 
 
 def _sky(emissivity: Array, noise: Array, names: list[str]) -> Array:

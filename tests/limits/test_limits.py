@@ -306,13 +306,14 @@ def test_plan_of_fast_cameras_is_that_of_all_frames(
 ) -> None:
     """At most every other frame is computed, and no deviation differs by 1 %."""
     table = TABLE.sel(material=["plate window glass"], band=["8-14", "9.5"])
-    design, sizes = limits.CaptureDesign(**conditions), []
+    design, sizes = limits.CaptureDesign(**conditions), list[int]()
     order = _fisher.smallest_order
-    monkeypatch.setattr(
-        _fisher,
-        "smallest_order",
-        lambda truth, it: sizes.append(truth.time.size) or order(truth, it),
-    )
+
+    def counted(truth: Any, sensitivity: Any) -> Any:
+        sizes.append(truth.time.size)
+        return order(truth, sensitivity)
+
+    monkeypatch.setattr(_fisher, "smallest_order", counted)
     quick = limits.plan(table, NETD, design)
     monkeypatch.setattr(limits, "_RESOLVED", 10**9)
     whole = limits.plan(table, NETD, design)
