@@ -156,6 +156,19 @@ CASES: list[tuple[Call, str]] = [
     (lambda: limits.CaptureDesign(level=22.0), "level 22.0.*in kelvin"),
     (lambda: fitted(room_temperature=22.0), "room_temperature of the response 22.0.*in kelvin"),
     (lambda: fitted(gain_std=2.0), "gain_std of the response 2.0"),
+    *(
+        (partial(calibration.fit_response, CAMERA["counts"], **cast(Any, {name: value})), name)
+        for name in ("blackbody_accuracy", "blackbody_emissivity", "room_temperature")
+        for value in ("0.1", None, True, [0.1, 0.2], np.nan)
+    ),
+    (lambda: fitted(background_ratio_std=cast(Any, "0.1")), "background_ratio_std '0.1'"),
+    (lambda: noise.estimate(ONE, ONE, 3.0), r"time \[s\] 3.0 of shape"),
+    (lambda: separation.without_calibration(RESULT, drift=cast(Any, "no")), "drift 'no'"),
+    (lambda: walked(crossings=cast(Any, "7")), "crossings '7'"),
+    (
+        lambda: simulation.blackbody_movies(RIG, np.array([280.0]), cast(Any, 1.5), DETECTOR, RNG),
+        "frames 1.5",
+    ),
     (lambda: figures.status(NOTHING), "Invalid result of type NoneType"),
     (lambda: store.save_figure(NOTHING, "a.png", {}), "Invalid figure of type NoneType"),
     (lambda: store.provenance(cast(Any, [1])), "Invalid parameters of type list"),
@@ -450,13 +463,12 @@ def test_times_differ_beyond_rounding(here: Any, there: Any, *, same: bool) -> N
 )
 def test_a_capture_without_samples_is_named(capture: xr.Dataset) -> None:
     """All pixels are flagged; a mask of everything is said in the same words."""
-    for call in (
+    calls: tuple[Call, ...] = (
         lambda: separation.separate(capture, CAMERA),
         lambda: solve(mask=PIXELS & False),
-    ):
-        with pytest.warns(
-            UserWarning, match="Invalid samples in all of 48 pixels.*Must be"
-        ) as notes:
+    )
+    for call in calls:
+        with pytest.warns(UserWarning, match="Invalid samples in all of 48 pixels.*Must") as notes:
             result = call()
         assert np.all(result["status"] == np.uint32(Status.INVALID_SAMPLES))
         assert str(notes[0].message) in result.attrs["warnings"]
