@@ -70,7 +70,7 @@ def test_times_of_npz_and_arrays_of_other_libraries(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"frames \(1, 3, 24, 32\)\. .* squeeze axes"):
         read(hdf5(tmp_path / "b.h5", scene()[np.newaxis]))
     savemat(tmp_path / "struct.mat", {"camera": {"frames": scene()}})
-    with pytest.raises(ValueError, match=r"none outside structs, cells.*save each field"):
+    with pytest.raises(ValueError, match=r"none outside structs, cells.*save bands, fields"):
         read(tmp_path / "struct.mat")
 
 
