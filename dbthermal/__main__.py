@@ -315,8 +315,8 @@ def _reason(error: Exception, options: argparse.Namespace) -> str:
     if isinstance(error, ImportError) and (extra := _EXTRAS.get(library)):
         extra = "report" if options.command == "report" else extra  # which has all that it needs
         return str(import_module("dbthermal._text").missing_library(error.name, extra))
-    if isinstance(error, FileNotFoundError) and error.filename:  # of the system, not of dbthermal
-        return f"No file or folder '{error.filename}'. Must exist."
+    if isinstance(error, FileNotFoundError) and error.errno:  # of the system, not of dbthermal
+        return f"No file or folder '{error.filename or '. (current folder)'}'. Must exist."
     message = " ".join(str(error.args[0] if isinstance(error, KeyError) else error).split())
     if isinstance(error, MemoryError) or "start new thread" in message:
         output = f", '{options.output}' is not written" if "output" in options else ""

@@ -40,13 +40,13 @@ _USED: Final = (*_CONSTANTS, tuple, np.ndarray, Dispatcher)  # of a module, in m
 def kept(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Decorator that compiles a function at its first call, and keeps its machine code."""
 
-    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+    def decorate(function: Callable[..., Any]) -> Any:
         result: Any = njit(**options)(function)
-        with suppress(RuntimeError):
-            result._cache = cache = _Cache(result)
-            result.compile = cache.in_turn(result.compile)
-        decorated: Callable[..., Any] = result
-        return decorated
+        if hasattr(result, "py_func"):  # with NUMBA_DISABLE_JIT it is the function itself
+            with suppress(RuntimeError):
+                result._cache = cache = _Cache(result)
+                result.compile = cache.in_turn(result.compile)
+        return result
 
     return decorate
 

@@ -86,8 +86,8 @@ def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, f
         label = f"{frames} frames and {pixels} usable pixels to estimate a noise from"
         rule = f"Must have at least {MINIMUM_FRAMES} frames and 1 pixel; or give the noise"
         raise ValueError(f"Invalid capture of {label}. {rule}.")
-    for signal in (first, second):
-        schema.require_measured(signal, "signal")
+    schema.require_measured(np.stack([first, second]), "signal")
+    time = _numbers.real_numbers("time [s]", time, shape=(frames,))
     # Remove the object: smooth functions, then second differences.
     functions = _smooth.polynomial_basis(time, min(_ORDER, frames // 4))
     rapid = [signal - functions @ (functions.T @ signal) for signal in (first, second)]

@@ -301,7 +301,7 @@ class Flags(IntFlag):
 class Status(Flags):
     """Validity of a pixel, bits of `status` that are combined by OR; 0 is good.
 
-    What to do about each is in docs/status.md; `has_flag` asks for some by name.
+    `Status.GRAY.meaning` says what that bit means; `has_flag` asks for some by name.
     """
 
     NO_BACKGROUND_MOTION = 1 << 0, "no rapid change of the reflection: nothing is measured"
@@ -483,9 +483,9 @@ def band_positions(array: xr.DataArray | xr.Dataset, wanted: list[str], label: s
         raise ValueError(f"Missing coordinate 'band' of {label}. Must name each band.")
     names = [str(name) for name in np.atleast_1d(array["band"].values)]
     if len(set(names)) != len(names):
-        raise ValueError(f"Repeated band in {names} of {label}. Each band must occur once.")
+        raise ValueError(f"Repeated band in {names} of {label}. Must occur once.")
     if missing := [name for name in wanted if name not in names]:
-        raise ValueError(f"Missing band '{missing[0]}' in {label}. Has {names}.")
+        raise ValueError(f"Missing band '{missing[0]}' in {label}, of {names}. Must be there.")
     return [names.index(name) for name in wanted]
 
 

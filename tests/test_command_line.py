@@ -775,6 +775,19 @@ def test_a_temperature_in_words_is_no_file(tmp_path: Path) -> None:
     assert "No file or folder '25.csq'" in line
 
 
+def test_a_deleted_folder_is_named(tmp_path: Path) -> None:
+    """The system gives no name for the folder that a command was started in, and that is gone."""
+    script = "import sys, os; from dbthermal.__main__ import main; os.rmdir(os.getcwd()); "
+    script += "sys.exit(main(['demo', 'out']))"
+    (tmp_path / "gone").mkdir()
+    command = [sys.executable, "-c", script]
+    answer = subprocess.run(
+        command, cwd=tmp_path / "gone", capture_output=True, text=True, check=False
+    )
+    assert answer.returncode == 1
+    assert "No file or folder '. (current folder)'. Must exist." in answer.stderr
+
+
 def test_a_material_named_twice_is_planned_once(tmp_path: Path) -> None:
     """Its numbers are those of the material named once."""
     command = ["plan", "--noise", "0.03"]

@@ -75,6 +75,29 @@ def started(folder: Path, *states: str) -> "subprocess.Popen[str]":
     return subprocess.Popen(command, cwd=folder, env=environment, stdout=subprocess.PIPE, text=True)
 
 
+def test_functions_run_as_python_without_a_compiler() -> None:
+    """With NUMBA_DISABLE_JIT, as debuggers and coverage need it, a separation gives the same."""
+    script = """
+import numpy as np, xarray as xr
+from dbthermal import separation, simulation
+rig, rng = simulation.Rig(bad_fraction=0.0), np.random.default_rng(1)
+glass = xr.DataArray([0.86, 0.72], {"band": list(rig.bands)}, "band")
+scene = simulation.walkers(np.arange(60) / 10, (1, 2), glass, rng)
+result = separation.solve(simulation.observe(scene, rig.response(), rng), rig.response())
+print(*result["object_temperature"].values.ravel().tolist())
+"""
+    answers = []
+    for disabled in "01":
+        environment = {**os.environ, "PYTHONPATH": str(ROOT), "NUMBA_DISABLE_JIT": disabled}
+        command = [sys.executable, "-c", script]
+        answer = subprocess.run(
+            command, env=environment, capture_output=True, text=True, check=True
+        )
+        answers.append([float(number) for number in answer.stdout.split()])
+    assert len(answers[0]) == 120
+    np.testing.assert_allclose(answers[0], answers[1], atol=1e-3)  # K, of sums in another order
+
+
 def files(folder: Path) -> dict[str, int]:
     """Names of the functions whose code is kept, and when it was written [ns]."""
     kept = (folder / "kept").rglob("*.nbc")

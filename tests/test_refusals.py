@@ -156,6 +156,19 @@ CASES: list[tuple[Call, str]] = [
     (lambda: limits.CaptureDesign(level=22.0), "level 22.0.*in kelvin"),
     (lambda: fitted(room_temperature=22.0), "room_temperature of the response 22.0.*in kelvin"),
     (lambda: fitted(gain_std=2.0), "gain_std of the response 2.0"),
+    *(
+        (partial(calibration.fit_response, CAMERA["counts"], **cast(Any, {name: value})), name)
+        for name in ("blackbody_accuracy", "blackbody_emissivity", "room_temperature")
+        for value in ("0.1", None, True, [0.1, 0.2], np.nan)
+    ),
+    (lambda: fitted(background_ratio_std=cast(Any, "0.1")), "background_ratio_std '0.1'"),
+    (lambda: noise.estimate(ONE, ONE, 3.0), r"time \[s\] 3.0 of shape"),
+    (lambda: separation.without_calibration(RESULT, drift=cast(Any, "no")), "drift 'no'"),
+    (lambda: walked(crossings=cast(Any, "7")), "crossings '7'"),
+    (
+        lambda: simulation.blackbody_movies(RIG, np.array([280.0]), cast(Any, 1.5), DETECTOR, RNG),
+        "frames 1.5",
+    ),
     (lambda: figures.status(NOTHING), "Invalid result of type NoneType"),
     (lambda: store.save_figure(NOTHING, "a.png", {}), "Invalid figure of type NoneType"),
     (lambda: store.provenance(cast(Any, [1])), "Invalid parameters of type list"),
@@ -273,6 +286,10 @@ CASES: list[tuple[Call, str]] = [
     (
         lambda: separation.materials(RESULT.drop_vars("reflection_ratio"), CAPTURE, CAMERA),
         "Missing variable 'reflection_ratio' in the",
+    ),
+    (
+        lambda: separation.materials(RESULT.isel(band=[1]), CAPTURE, CAMERA),
+        r"Missing band '8-14' in the result, of \['9.5'\]. Must be there",
     ),
     (lambda: separation.materials(RESULT, TURNED, CAMERA), "Invalid dims"),
     (lambda: correction.Reference(CAMERA, TWICE, (300.0, 300.0)), "Must differ"),
@@ -439,6 +456,22 @@ def test_times_differ_beyond_rounding(here: Any, there: Any, *, same: bool) -> N
     else:
         with pytest.raises(ValueError, match="Invalid 'time' of "):
             laid_on(second, first, "the second", "the first")
+
+
+@pytest.mark.parametrize(
+    "capture", [CAPTURE.where(COUNTS < 0), CAPTURE.where(COUNTS["band"] != "9.5")]
+)
+def test_a_capture_without_samples_is_named(capture: xr.Dataset) -> None:
+    """All pixels are flagged; a mask of everything is said in the same words."""
+    calls: tuple[Call, ...] = (
+        lambda: separation.separate(capture, CAMERA),
+        lambda: solve(mask=PIXELS & False),
+    )
+    for call in calls:
+        with pytest.warns(UserWarning, match="Invalid samples in all of 48 pixels.*Must") as notes:
+            result = call()
+        assert np.all(result["status"] == np.uint32(Status.INVALID_SAMPLES))
+        assert str(notes[0].message) in result.attrs["warnings"]
 
 
 def test_a_reference_far_off_is_named() -> None:

@@ -134,7 +134,7 @@ MILLI, NOTHING = xr.DataArray([300.0], dims="x", attrs={"units": "mK"}), cast(An
 test_what_is_no_response = refused(
     lambda known, call, options: call(known, **options),
     [
-        (curve_of, {"band": "10.6"}, "Missing band '10.6' in the response. Has ['8-14', '9.5']"),
+        (curve_of, {"band": "10.6"}, "Missing band '10.6' in the response, of ['8-14', '9.5']"),
         (curve_of, {"kind": "cubic"}, "Unknown kind of response 'cubic'. Must be one of"),
         (lambda r: curve_of(r.drop_vars("offset")), {}, "Missing variable 'offset' in the"),
         (curve_of, {"offset": np.nan}, "Invalid offset of the response in band '9.5'"),

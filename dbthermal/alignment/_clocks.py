@@ -145,11 +145,7 @@ def _check_stamps(stamps: Array, label: str) -> None:
     if stamps.size < _MINIMUM_FRAMES or not np.all(np.isfinite(stamps)):
         rule = f"Must be finite, {_MINIMUM_FRAMES} at least, or NaN where there is no frame"
         raise ValueError(f"Invalid exposure times of {label}: {stamps.size} stamps. {rule}.")
-    steps = np.diff(stamps)
-    if np.any(steps <= 0):
-        place = int(np.argmax(steps <= 0))
-        pair = f"{stamps[place]} s is followed by {stamps[place + 1]} s"
-        raise ValueError(f"Unordered exposure times of {label}: {pair}. Must increase strictly.")
+    schema.require_rising(stamps, f"exposure times of {label}", "s")
 
 
 def missing(frames: npt.NDArray[Any]) -> Mask:

@@ -154,10 +154,10 @@ def fit_response(  # noqa: PLR0913 - what is known of blackbody and cameras, by 
     drifts = {"offset_std": offset_std, "gain_std": gain_std, "pattern_std": pattern_std}
     accuracies: dict[str, Any] = {
         **drifts,
-        "blackbody_accuracy": blackbody_accuracy,
-        "blackbody_emissivity": blackbody_emissivity,
-        "room_temperature": room_temperature,
-        "background_ratio_std": background_ratio_std,
+        "blackbody_accuracy": _numbers.real_number("blackbody_accuracy", blackbody_accuracy),
+        "blackbody_emissivity": _numbers.real_number("blackbody_emissivity", blackbody_emissivity),
+        "room_temperature": _numbers.real_number("room_temperature", room_temperature),
+        "background_ratio_std": _numbers.real_number("background_ratio_std", background_ratio_std),
     }
     for name in drifts:
         values = _numbers.real_numbers(name, accuracies[name])

@@ -8,6 +8,7 @@ divided by the noise :math:`s_m`, so that the information is a sum of their prod
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -60,6 +61,11 @@ class Sensitivity:
         """Sensitivity of some of the pixels."""
         return Sensitivity(*(getattr(self, field.name)[..., pixels] for field in fields(self)))
 
+    @cached_property
+    def free(self) -> Array:
+        """Variance (time, pixel) [K2] of a frame's background, 1 / v^T v; 0 at rest."""
+        return np.asarray(~self.resting / np.sum(self.reflection**2, axis=0))
+
     def projection(self) -> Array:
         r"""Projection (band, band, time, pixel) that eliminates the free background of a frame.
 
@@ -67,10 +73,8 @@ class Sensitivity:
 
         with v the reflection, over the bands; the unit matrix in a frame at rest.
         """
-        free = ~self.resting / np.sum(self.reflection**2, axis=0)
-        outer = self.reflection[:, np.newaxis] * self.reflection * free
         unit = np.eye(len(self.reflection))[..., np.newaxis, np.newaxis]
-        return np.asarray(unit - outer)
+        return np.asarray(unit - self.reflection[:, np.newaxis] * self.reflection * self.free)
 
 
 @dataclass(frozen=True)
@@ -180,33 +184,31 @@ def _deviations(
     of_emissivity = np.eye(bands, bands + order + 1)[np.newaxis]
     of_object = np.zeros((1, frames, bands + order + 1))
     of_object[0, :, bands:-1] = functions
-    of_background, free_variance = _background(sensitivity, functions)
+    of_background = _background(sensitivity, functions)
     of_ratio = np.zeros((emissivity.shape[1], bands, bands + order + 1))
     of_ratio[:, range(bands), range(bands)] = -1.0 / (1.0 - emissivity[reference])[:, np.newaxis]
     of_ratio[:, :, reference] += ((1.0 - emissivity) / (1.0 - emissivity[reference]) ** 2).T
     of_ratio[:, reference] = 0.0  # 1 by definition, not but for rounding
     variances = {
         "object_temperature": variance(of_object),
-        "background_temperature": variance(of_background) + free_variance,
+        "background_temperature": variance(of_background) + sensitivity.free.T,
         "emissivity": variance(of_emissivity),
         "reflection_ratio": variance(of_ratio),
     }
     return {name: np.sqrt(values.T) for name, values in variances.items()}
 
 
-def _background(sensitivity: Sensitivity, functions: Array) -> tuple[Array, Array]:
-    """Gradient (pixel, time, unknown) and own variance (pixel, time) of each frame's background."""
+def _background(sensitivity: Sensitivity, functions: Array) -> Array:
+    """Gradient (pixel, time, unknown) of each frame's background."""
     # A free frame: dy = -v^T (g de + p dx) / v^T v, own variance 1 / v^T v; at rest: the level.
-    energy = np.sum(sensitivity.reflection**2, axis=0)
-    along = sensitivity.reflection * ~sensitivity.resting / energy
+    along = sensitivity.reflection * sensitivity.free
     of_object = np.sum(along * sensitivity.emission, axis=0)
     derivatives = [
         -np.moveaxis(along * sensitivity.contrast, 0, -1),
         -of_object[..., np.newaxis] * functions[:, np.newaxis],
         sensitivity.resting[..., np.newaxis],
     ]
-    gradient = np.concatenate(derivatives, axis=-1)
-    return np.swapaxes(gradient, 0, 1), (~sensitivity.resting / energy).T
+    return np.swapaxes(np.concatenate(derivatives, axis=-1), 0, 1)
 
 
 def fisher_variance(

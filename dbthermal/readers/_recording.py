@@ -190,8 +190,8 @@ def array_name(names: Collection[str], name: str | None, path: Path, shapes: Seq
         if candidate in names:
             return candidate
     if not names:
-        rule = "Must have one: stack images, squeeze axes, save each band; a store is a capture"
-        label = f"'{path.name}', which has {', '.join(shapes[:3]) or 'none'}"
+        rule = "Must have one: stack images, squeeze axes, save bands, fields; a store is a capture"
+        label = f"'{path.name}', which has {', '.join(shapes[:3]) or 'none outside structs, cells'}"
         raise ValueError(f"Missing array (time, y, x) in {label}. {rule}.")
     wanted = "name of one of the arrays (--variable)" if name is None else f"array '{name}'"
     listed = sorted(names)[:_LISTED] + ["..."] * (len(names) > _LISTED)

@@ -29,8 +29,8 @@ from typing import Any, Final
 import numpy as np
 import xarray as xr
 
+from dbthermal import _numbers, schema
 from dbthermal import response as responses
-from dbthermal import schema
 from dbthermal._arrays import Array, empty, release
 from dbthermal.emissivity import Colour
 from dbthermal.response import Accuracy
@@ -79,10 +79,10 @@ def without_calibration(result: xr.Dataset, *, drift: bool = True) -> xr.Dataset
     """
     schema.check(result, "separated")
     alone = result.drop_vars(["cause", *BUDGETS.values()], errors="ignore")
-    causes, by_drift = [*CALIBRATION], np.zeros(1) if drift else _drift(result)
+    by_drift = np.zeros(1) if _numbers.truth_value("drift", drift) else _drift(result)
     for name in (name for name, budget in BUDGETS.items() if budget in result):
         # Of the background the drift's part goes with the contrast of each frame, see below.
-        parts = [*causes, "drift"] if not drift and name == "emissivity" else causes
+        parts = [*CALIBRATION, *(["drift"] if not drift and name == "emissivity" else [])]
         deviations = result[BUDGETS[name]].sel(cause=parts).values
         variance, std = (deviations.astype(np.float64) ** 2).sum(axis=0), result[f"{name}_std"]
         values = empty(std.shape, std.dtype)

@@ -126,5 +126,5 @@ def hardly_measured(result: xr.Dataset) -> list[str]:
     reasons = sorted(shares, key=lambda name: -shares[name])[:_REASONS]
     named = ", ".join(f"{name} {shares[name]:.0%}" for name in reasons if shares[name] > 0)
     sentences = f"{share:.0%} of the {moving.size} pixels with moving reflections have no flag"
-    rule = "What to do about each flag is in docs/status.md"
+    rule = "dbthermal.schema.Status says what each flag means"
     return [f"Hardly anything was measured: {sentences}. Of all pixels: {named}. {rule}."]

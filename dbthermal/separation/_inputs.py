@@ -261,7 +261,12 @@ def decide_noise(
         rounding = samples.rounding_std(counts) / slopes
         wide = np.sqrt(12.0) * rounding > stated_noise
         stated = np.asarray(np.hypot(stated_noise, np.where(wide, rounding, 0.0)) * factor)
-        signals = np.where(schema.measured(counts), counts, np.nan) / slopes[:, None, None]
+        valid = schema.measured(counts)
+        if not decided and not (valid.all(axis=0).any() and capture.get("mask", valid).any()):
+            label = f"Invalid samples in all of {counts.shape[2]} pixels, evenly spaced"
+            rule = "Must be numbers in all bands, not masked; else flagged invalid_samples"
+            response = warned(response, f"{label}. {rule}.")
+        signals = np.where(valid, counts, np.nan) / slopes[:, None, None]
         larger = np.nan * stated if decided else samples.larger_noise(signals, stated)
         if np.isnan(larger).all():
             return response.assign_attrs(noise_source="response"), stated
@@ -297,11 +302,9 @@ def _check_clock(capture: xr.Dataset, method: Method, curves: list[Curve], noise
 
 def _pattern(capture: xr.Dataset, curves: list[Curve]) -> Array:
     """Deviation (band) [K] of a residual fixed pattern, 0 without a variable `pattern_std`."""
-    stated = capture["pattern_std"].values if "pattern_std" in capture else np.zeros(len(curves))
-    counts = stated.astype(np.float64)
+    counts = np.asarray(capture.get("pattern_std", np.zeros(len(curves))), np.float64)
     if not np.all((counts >= 0) & schema.measured(counts)):
-        values = counts.tolist()
-        raise ValueError(f"Invalid pattern_std {values} count. Must be zero or positive, finite.")
+        raise ValueError(f"Invalid pattern_std {counts} count. Must be zero or positive, finite.")
     return np.asarray(counts / [curve.reference_slope for curve in curves])
 
 
@@ -320,9 +323,7 @@ def _known_emissivity(
     if std is not None and covariance is not None:
         raise ValueError("Invalid emissivity_std beside an emissivity_covariance. Give one.")
     values = _over_image(corrected, emissivity, "emissivity")
-    bad = ~((values > 0) & (values < 1))
-    if np.any(bad):
-        band, y, x = np.argwhere(bad)[0]
+    for band, y, x in np.argwhere(~((values > 0) & (values < 1))):
         place = f"in band '{corrected['band'].values[band]}', pixel ({y}, {x})"
         raise ValueError(f"Invalid emissivity {values[band, y, x]} {place}. Must lie in (0, 1).")
     if np.all(values == values[0]):
@@ -335,9 +336,7 @@ def _known_emissivity(
             rule = "Must be symmetric and have no negative eigenvalue"
             raise ValueError(f"Invalid emissivity_covariance. {rule}.")
         return values, together
-    deviations = np.zeros_like(values)
-    if std is not None:
-        deviations = _over_image(corrected, std, "emissivity_std")
+    deviations = 0.0 * values if std is None else _over_image(corrected, std, "emissivity_std")
     if not np.all((deviations >= 0) & schema.measured(deviations)):
         raise ValueError("Invalid emissivity_std. Must be zero or positive, and finite.")
     return values, np.eye(len(values))[..., np.newaxis, np.newaxis] * deviations**2

@@ -257,8 +257,8 @@ def walkers(
     warm = level + curve[:, np.newaxis, np.newaxis] * profile
     cold = np.full(warm.shape, level)
     # Background: each person crosses the view once.
-    places = np.arange(crossings) + rng.random(crossings)
-    for start in time[0] + (time[-1] - time[0]) * places / crossings:
+    late = rng.random(_numbers.whole_number("crossings", crossings, (0, 2**31)))
+    for start in time[0] + (time[-1] - time[0]) * (np.arange(crossings) + late) / crossings:
         # In either direction, from beyond the edge of the view.
         pace = rng.choice([-1.0, 1.0]) * rng.uniform(0.6, 1.2)
         centre = np.sign(pace) * -1.6 + pace * (time - start)
@@ -504,7 +504,7 @@ def blackbody_movies(
     [108.0, 11.0]
     """
     response = rig.response()
-    shape = (frames, *detector["gain"].shape[1:])
+    shape = (_numbers.whole_number("frames", frames, (1, 2**31)), *detector["gain"].shape[1:])
     level = xr.DataArray(temperatures, dims="temperature", name="temperature")
     movies = np.empty((len(rig.bands), len(temperatures), *shape), dtype=np.uint16)
     for index, counts in enumerate(_blackbody(response, level)):

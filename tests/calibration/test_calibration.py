@@ -168,7 +168,7 @@ def at(counts: xr.DataArray, first: float, last: float) -> xr.DataArray:
 test_bad_noise_and_accuracy = refused(
     lambda stated: calibration.fit_response(blackbody(), **stated),
     [
-        ({"noise": noise_of(3.0)}, "Missing band '9.5' in the noise. Has ['8-14']"),
+        ({"noise": noise_of(3.0)}, "Missing band '9.5' in the noise, of ['8-14']"),
         ({"noise": noise_of(3, 4).drop_vars("band")}, "Missing coordinate 'band' of the noise"),
         ({"noise": noise_of(3, 4).rename(band="filter")}, "Invalid dims ('filter',) of the noise"),
         ({"noise": noise_of(0.03, 0.35, units="K")}, "Invalid units 'K' of the noise"),

@@ -14,7 +14,7 @@ from refused import refused
 
 from dbthermal import emissivity, limits, mixing, simulation
 from dbthermal import response as responses
-from dbthermal.limits import SKY
+from dbthermal.limits import SKY, _fisher
 from dbthermal.simulation import Background, Rig
 from reproduction.experiments.cases import ratio_variance_bound, reflection_ratio
 
@@ -296,6 +296,30 @@ def test_plan_is_the_bound() -> None:
     ratio = float(found["reflection_ratio_std"].sel(band="9.5").item())
     planned = expected["reflection_ratio_std"].sel(band="9.5")
     assert float(planned[0]) == pytest.approx(ratio, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    "conditions", [{"rate": 1000.0}, {"rate": 317.3}, {"rate": 1000.0, "seconds": 2.0}], ids=str
+)
+def test_plan_of_fast_cameras_is_that_of_all_frames(
+    monkeypatch: pytest.MonkeyPatch, conditions: dict[str, float]
+) -> None:
+    """At most every other frame is computed, and no deviation differs by 1 %."""
+    table = TABLE.sel(material=["plate window glass"], band=["8-14", "9.5"])
+    design, sizes = limits.CaptureDesign(**conditions), list[int]()
+    order = _fisher.smallest_order
+
+    def counted(truth: Any, sensitivity: Any) -> Any:
+        sizes.append(truth.time.size)
+        return order(truth, sensitivity)
+
+    monkeypatch.setattr(_fisher, "smallest_order", counted)
+    quick = limits.plan(table, NETD, design)
+    monkeypatch.setattr(limits, "_RESOLVED", 10**9)
+    whole = limits.plan(table, NETD, design)
+    assert 2 * sizes[0] <= sizes[1] == round(design.seconds * design.rate)
+    for name in whole.data_vars.keys() - {"best"}:
+        np.testing.assert_allclose(quick[name], whole[name], rtol=0.01, err_msg=name)
 
 
 def test_plan_outdoors_says_what_the_sky_costs() -> None:

@@ -69,6 +69,9 @@ def test_times_of_npz_and_arrays_of_other_libraries(tmp_path: Path) -> None:
         read(hdf5(tmp_path / "b.h5", _long_name="Temperature in 0.01 K"))
     with pytest.raises(ValueError, match=r"frames \(1, 3, 24, 32\)\. .* squeeze axes"):
         read(hdf5(tmp_path / "b.h5", scene()[np.newaxis]))
+    savemat(tmp_path / "struct.mat", {"camera": {"frames": scene()}})
+    with pytest.raises(ValueError, match=r"none outside structs, cells.*save bands, fields"):
+        read(tmp_path / "struct.mat")
 
 
 def test_a_store_of_our_own_is_no_camera(tmp_path: Path) -> None:

@@ -389,7 +389,8 @@ def solve(
         materials[:] = np.stack([*numbers, *spreads, *material.ratio], 1)
     errors = np.stack([tile.scaled(tile.noise).T, tile.scaled(tile.pattern or (0.0,) * bands).T])
     films = np.empty((4, frames, pixels), np.float32)
-    record, sums = np.zeros(pixels, RECORD), np.zeros((2, shared.parts.size - 1, pixels))
+    record = np.zeros(pixels, RECORD).view(np.recarray)  # has its names also where not compiled
+    sums = np.zeros((2, shared.parts.size - 1, pixels))
     vectors, matrices = np.zeros((pixels, 4, bands)), np.zeros((pixels, 4, bands, bands))
     signals = np.ascontiguousarray(tile.signals, dtype=np.float64)
     solved = Solved(films, record, vectors, matrices, sums)
