@@ -111,9 +111,14 @@ materials name*         names as listed by 'data'; all by default
 """
 """Argument, kind and help: ``!`` is required, ``&`` may be repeated, ``=`` is the default."""
 
-_VALUES: Final = {"--at": "TEMPERATURE FILE", "--sweep": "FOLDER SESSION", "--rows": "Y0 Y1"}
-_VALUES.update({"--shape": "ROWS COLUMNS", "--pixel": "Y X", "--region": "Y0 Y1 X0 X1"})
-"""Option -> names of its values in the help, where it is not that of its kind."""
+_VALUES: Final = {  # option -> names of its values in the help, where it is not that of its kind
+    "--at": "TEMPERATURE FILE",
+    "--sweep": "FOLDER SESSION",
+    "--shape": "ROWS COLUMNS",
+    "--pixel": "Y X",
+    "--region": "Y0 Y1 X0 X1",
+    "--rows": "Y0 Y1",
+}
 
 _METHODS: Final = (
     "subspace (first step of the default), calibrated (emissivities as stated), "

@@ -22,9 +22,13 @@ from dbthermal.response import ACCURACY
 from dbthermal.schema import warned
 from dbthermal.store import _integrity as integrity
 
-_MADE_BY = {"capture": "import", "response": "calibrate", "separated": "separate"}
-_MADE_BY["correction"] = "calibrate --correction-output"
-_MADE_BY["corrected"] = "correct ('separate --correction' takes raw counts)"
+_MADE_BY = {
+    "capture": "import",
+    "correction": "calibrate --correction-output",
+    "corrected": "correct ('separate --correction' takes raw counts)",
+    "response": "calibrate",
+    "separated": "separate",
+}
 READERS: Final[dict[str, tuple[Callable[..., xr.Dataset], tuple[str, ...]]]] = {
     "TIFF": (readers.tiff, (".tif", ".tiff", ".btf", ".png")),
     "arrays": (readers.array, (".npy", ".npz", ".nc", ".cdf", ".h5", ".hdf5", ".mat", ".zarr")),
@@ -361,9 +365,10 @@ def summary(dataset: xr.Dataset, *, everything: bool = False) -> dict[str, Any]:
                 lines[f"median_{name}{unit}"] = medians.round(4).to_series().to_dict()
     if not everything:
         return lines
-    lines["variables"] = variables = dict[str, str]()
-    for key, array in dataset.data_vars.items():
-        variables[str(key)] = f"{array.dtype} {array.dims} [{array.attrs.get('units', '-')}]"
+    lines["variables"] = {
+        str(name): f"{array.dtype} {array.dims} [{array.attrs.get('units', '-')}]"
+        for name, array in dataset.data_vars.items()
+    }
     long = ("provenance", "files", "transform")
     lines["attributes"] = {name: value for name, value in attrs.items() if name not in long}
     return lines | {name: attrs.get(name, {}) for name in long[:2]}

@@ -286,10 +286,10 @@ def foreseen(options: Namespace, sources: list[Path], targets: list[Path]) -> di
     if sized and (stage := _OUTPUTS.get(options.command)):
         lengths = {**sized[0], "axis": 2, "cause": len(schema.CAUSES)}
         lengths["other_band"] = lengths["band"]
-        summary["would_write_bytes_at_most"] = 0
-        for it in {**schema.STAGES[stage], **schema.OPTIONAL[stage]}.values():
-            size = math.prod(lengths[dim] for dim in it.dims) * np.dtype(it.dtype).itemsize
-            summary["would_write_bytes_at_most"] += size
+        summary["would_write_bytes_at_most"] = sum(
+            math.prod(lengths[dim] for dim in variable.dims) * np.dtype(variable.dtype).itemsize
+            for variable in {**schema.STAGES[stage], **schema.OPTIONAL[stage]}.values()
+        )
     if targets:
         place = next(folder for folder in targets[0].absolute().parents if folder.is_dir())
         summary["free_bytes"] = shutil.disk_usage(place).free

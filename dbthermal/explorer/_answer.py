@@ -65,9 +65,11 @@ def answer(result: xr.Dataset, materials: xr.Dataset | None = None) -> tuple[lis
         sentences.append(f"Emissivity at {entry['pixels']} pixels, like {name}: {values}.")
     doubts = [*result.attrs.get("warnings", []), *hardly_measured(result)]
     flagged = {bit: np.mean((status & np.uint32(bit)) != 0) for bit in Status}
-    for bit, share in sorted(flagged.items(), key=lambda entry: -entry[1]):
-        if share >= _DOUBTED and not bit & schema.COMPLETED:
-            doubts.append(f"{share:.0%} of the pixels are flagged {bit.label}: {bit.meaning}.")
+    doubts += [
+        f"{share:.0%} of the pixels are flagged {bit.label}: {bit.meaning}."
+        for bit, share in sorted(flagged.items(), key=lambda entry: -entry[1])
+        if share >= _DOUBTED and not bit & schema.COMPLETED
+    ]
     return sentences + [f"Watch out: {doubt}" for doubt in dict.fromkeys(doubts)], numbers
 
 
@@ -96,9 +98,10 @@ def by_material(result: xr.Dataset, measured: Mask, table: xr.Dataset) -> list[d
     bands = [str(band) for band in result["band"].values]
     budget = result.get(schema.BUDGETS["emissivity"])
     drift = 0.0 * result["emissivity_std"] if budget is None else budget.sel(cause="drift")
-    maps = [result["emissivity"], result["emissivity_std"], drift]
-    samples = [it.transpose("band", "y", "x").values[:, measured].T for it in maps]
-    values, stds, drift_stds = (it.astype(np.float64) for it in samples)
+    values, stds, drift_stds = (
+        variable.transpose("band", "y", "x").values[:, measured].T.astype(np.float64)
+        for variable in (result["emissivity"], result["emissivity_std"], drift)
+    )
     finite = np.isfinite(values + stds).all(axis=1)
     values, stds, drift_stds = values[finite], stds[finite], drift_stds[finite]
     steady_stds = np.sqrt(np.maximum(stds**2 - drift_stds**2, 0.0))
@@ -123,8 +126,9 @@ def by_material(result: xr.Dataset, measured: Mask, table: xr.Dataset) -> list[d
     # Medians of each group, and the materials within a deviation; none for the vague group.
     listed = []
     for pixels in (pixels for pixels in groups if pixels.sum() >= max(1, _COMMON * len(values))):
-        arrays = (values, stds, steady_stds)
-        middle, std, steady = (np.median(array[pixels], axis=0) for array in arrays)
+        middle, std, steady = (
+            np.median(array[pixels], axis=0) for array in (values, stds, steady_stds)
+        )
         entry: dict[str, Any] = {"pixels": int(pixels.sum()), "nearest": []}
         for key, numbers in zip(_EMISSIVITIES, (middle, std, steady), strict=True):
             entry[key] = dict(zip(bands, numbers.tolist(), strict=True))

@@ -88,9 +88,11 @@ class View:
         if is_capture:
             self.capture, sources = self.data, {"capture": data, "response": response}
         # Sources in copied code: a path, or the name of a dataset in memory.
-        stated = {name: source for name, source in sources.items() if source is not None}
-        paths = {n: repr(str(it)) for n, it in stated.items() if isinstance(it, str | Path)}
-        self.sources = {name: paths.get(name, name) for name in stated}
+        self.sources = {
+            name: repr(str(source)) if isinstance(source, str | Path) else name
+            for name, source in sources.items()
+            if source is not None
+        }
         reference = self.data if is_capture else self.data.get("object_temperature")
         inputs = [] if self.capture is None else input_panes(self.capture, self.response, reference)
         results = [] if is_capture else _films.result_panes(self.data)
@@ -106,10 +108,11 @@ class View:
             self.doubts.append(f"{label}. Must be of the same recordings.")
             warnings.warn(self.doubts[0], stacklevel=2)
         schema.require(events, Mapping, "events")
-        self.events = _films.marks(shown, self.time)
-        for name, moment in events.items():
-            label = f"time [s] of the event {name!r}"
-            self.events[name] = _numbers.real_number(label, moment, _numbers.FINITE)
+        stated = {
+            name: _numbers.real_number(f"time [s] of the event {name!r}", moment, _numbers.FINITE)
+            for name, moment in events.items()
+        }
+        self.events = _films.marks(shown, self.time) | stated
 
     def pane(self, name: str, *box: slice) -> Pane:
         """Pane by its name, or of a box of it, copied to be read quickly; ValueError if unknown."""
@@ -314,12 +317,17 @@ class View:
         arguments = ", ".join([first, *(f"{key}={value}" for key, value in further)])
         free = [key for key, value in self.sources.items() if key == value]
         lines = [f"# {', '.join(free)}: the data that were explored"] if free else []
-        lines += ["from dbthermal.explorer import Region, View", "", f"view = View({arguments})"]
-        moment = f"(y, x) at {self.time[index]:.3f} s"
-        lines.append(f"frame = view.frame({name!r}, {index})  # {moment}")
+        lines += [
+            "from dbthermal.explorer import Region, View",
+            "",
+            f"view = View({arguments})",
+            f"frame = view.frame({name!r}, {index})  # (y, x) at {self.time[index]:.3f} s",
+        ]
         if name != "status" and regions:
             listed = pformat(dict(regions), width=88, sort_dicts=False)
             curve = f"view.curve({name!r}, region, pixels={pixels!r})"
-            lines.append(f"regions = {listed}")
-            lines.append(f"curves = {{key: {curve} for key, region in regions.items()}}")
+            lines += [
+                f"regions = {listed}",
+                f"curves = {{key: {curve} for key, region in regions.items()}}",
+            ]
         return "\n".join(lines) + "\n"

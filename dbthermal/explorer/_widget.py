@@ -110,21 +110,29 @@ class Explorer(anywidget.AnyWidget):
         """Answer panes, times, events and legend; palettes and classes of pixels."""
         view = self.view
         codes, entries = legend(xr.DataArray(view.status))
-        panes = list[dict[str, Any]]()
-        for name, pane in view.panes.items():
-            units = "" if pane.units == "1" else pane.units
-            shown = "_std" not in name or name == f"{next(iter(FILMS))}_std"
-            panes.append({"name": name, "label": pane.label, "kind": pane.kind, "shown": shown})
-            panes[-1] |= {"absolute": pane.absolute, "units": units}
+        panes = [
+            {
+                **{key: getattr(pane, key) for key in ("name", "label", "kind", "absolute")},
+                "units": pane.units if pane.units != "1" else "",
+                "shown": "_std" not in pane.name or pane.name == f"{next(iter(FILMS))}_std",
+            }
+            for pane in view.panes.values()
+        ]
         classes = np.where(view.status == 0, 0, np.where((view.status & COMPLETED) != 0, 1, 2))
         palettes = [colormaps[name](range(256), bytes=True) for name in PALETTES]
-        regions = [[name, entry.kind, entry.points] for name, entry in self.regions.items()]
-        answer: dict[str, Any] = {"panes": panes, "shape": view.shape, "events": view.events}
-        answer |= {"legend": entries, "index": self._state["index"]}
-        answer |= {"time": [round(float(entry), 6) for entry in view.time], "regions": regions}
-        answer |= {"palettes": PALETTES, "colors": drawing.COLORS, "celsius": self._celsius}
-        answer |= {"note": drawing.provenance_note(view.data).strip(" ()")}
-        return answer, [classes.astype(np.uint8), codes, *palettes]
+        return {
+            "panes": panes,
+            "shape": view.shape,
+            "time": [round(float(entry), 6) for entry in view.time],
+            "events": view.events,
+            "legend": entries,
+            "palettes": PALETTES,
+            "colors": drawing.COLORS,
+            "celsius": self._celsius,
+            "index": self._state["index"],
+            "regions": [[name, entry.kind, entry.points] for name, entry in self.regions.items()],
+            "note": drawing.provenance_note(view.data).strip(" ()"),
+        }, [classes.astype(np.uint8), codes, *palettes]
 
     def _answer_frames(self, request: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
         """Answer panes at a frame, and on which side of an isotherm their pixels are."""
@@ -179,8 +187,11 @@ class Explorer(anywidget.AnyWidget):
 
     def _answer_curves(self, request: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
         """Answer the curves of all regions in a pane."""
-        drawn = request["regions"]
-        self.regions = {name: Region(kind, tuple(map(tuple, line))) for name, kind, line in drawn}
+        points = {name: (kind, points) for name, kind, points in request["regions"]}
+        self.regions = {
+            name: Region(kind, tuple(map(tuple, outline)))
+            for name, (kind, outline) in points.items()
+        }
         self._state |= {"pixels": request["pixels"], "pane": request["pane"]}
         buffers, counts = [], []
         for region in self.regions.values():
@@ -202,9 +213,12 @@ class Explorer(anywidget.AnyWidget):
 
     def _answer_export(self, request: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
         """Answer a file of what is seen."""
-        stated = {name: request[name] for name in ("index", "celsius", "pixels", "palette")}
-        stated["limits"] = {name: tuple(pair) for name, pair in request["limits"].items()}
-        shown = _export.Shown(names=request["panes"], regions=self.regions, **stated)
+        shown = _export.Shown(
+            names=request["panes"],
+            regions=self.regions,
+            limits={name: tuple(pair) for name, pair in request["limits"].items()},
+            **{name: request[name] for name in ("index", "celsius", "pixels", "palette")},
+        )
         with TemporaryDirectory() as folder:
             path = Path(folder) / f"explored{request['suffix']}"
             _export.save(self.view, path, shown)

@@ -324,9 +324,12 @@ def plan(expected: xr.Dataset, durations: xr.Dataset, materials: Sequence[str]) 
     filtered = best[np.isin(best.values, std["filter"].values)]
     for index, name in enumerate(filtered["material"].values):
         chosen = str(filtered.sel(material=name).item())
-        line = durations["object_temperature_std"].sel(material=name, filter=chosen)
-        style = {"label": f"{name}, {chosen} {_MICRO}", **drawing.marked_line(index)}
-        bar_axis.loglog(durations["seconds"], line, **style)
+        bar_axis.loglog(
+            durations["seconds"],
+            durations["object_temperature_std"].sel(material=name, filter=chosen),
+            label=f"{name}, {chosen} {_MICRO}",
+            **drawing.marked_line(index),
+        )
     drawing.plain_ticks(bar_axis, durations["seconds"])
     drawing.plain_decades(bar_axis)
     bar_axis.set(xlabel="length of the film [s]", ylabel="expected std [K]")
@@ -398,10 +401,13 @@ def status(result: xr.Dataset) -> Figure:
     map_axis.set(xticks=[], yticks=[])
     legend_axis.set_axis_off()
     # Legend with shares.
-    labels = [f"{drawing.percent(share)}  {words}" for words, _, share in shown]
-    patches = [Patch(facecolor=color, edgecolor="0.5") for _, color, _ in shown]
-    style: Any = {"loc": "upper left", "borderaxespad": 0.0, "frameon": False, "fontsize": 9}
-    legend_axis.legend(patches, labels, **style)
+    patches = [
+        Patch(facecolor=color, edgecolor="0.5", label=f"{drawing.percent(share)}  {words}")
+        for words, color, share in shown
+    ]
+    legend_axis.legend(
+        handles=patches, loc="upper left", borderaxespad=0.0, frameon=False, fontsize=9
+    )
     shares = {words: share for words, _, share in shown}
     completed = sum(share for words, share in shares.items() if "completed" in words)
     good = f"{drawing.percent(shares.get(_GOOD[0], 0.0))} of the pixels have no flag"

@@ -244,8 +244,11 @@ def _times_of(arrays: dict[str, Any], name: str, path: Path) -> dict[str, Any]:
     if dims and (group, dims[0]) in lines:
         return {dims[0]: lines[group, dims[0]]}
     films = sum(array.ndim == 3 for array in arrays.values())
-    beside = [(place, key) for place, key in lines if place == group or films == 1]
-    named = {key: lines[place, key] for place, key in beside if _BESIDE.fullmatch(key)}
+    named = {
+        key: array
+        for (place, key), array in lines.items()
+        if _BESIDE.fullmatch(key) and (place == group or films == 1)
+    }
     for key, number in ((key, times.size) for key, times in named.items()):
         if number != frames and number in image:
             label = f"'{name}' of '{path.name}', {frames} frames of {image}: '{key}' has {number}"

@@ -56,11 +56,18 @@ _FIELDS: Final = {  # place in the camera's record [byte], type, and limits of p
     "range_min": (0x94, "f", 70.0, 2000.0),
     "frame_rate": (0x464, "H", 1, 1000),
 }
-_TEXTS: Final = {"camera_software": (0x114, 16)}  # place and size [byte]
-_TEXTS.update(camera_model=(0xD4, 32), lens_model=(0x170, 32), filter_model=(0x1EC, 16))
-_TEXTS.update(camera_part_number=(0xF4, 16), camera_serial_number=(0x104, 16))
-_TEXTS.update(lens_part_number=(0x190, 16), lens_serial_number=(0x1A0, 16))
-_TEXTS.update(filter_part_number=(0x1FC, 32), filter_serial_number=(0x21C, 32))
+_TEXTS: Final = {
+    "camera_model": (0xD4, 32),
+    "camera_part_number": (0xF4, 16),
+    "camera_serial_number": (0x104, 16),
+    "camera_software": (0x114, 16),
+    "lens_model": (0x170, 32),
+    "lens_part_number": (0x190, 16),
+    "lens_serial_number": (0x1A0, 16),
+    "filter_model": (0x1EC, 16),
+    "filter_part_number": (0x1FC, 32),
+    "filter_serial_number": (0x21C, 32),
+}
 _TIME: Final = 0x384  # whole seconds since 1970 UTC, milliseconds
 _CAMERA_SIZE: Final = 0x466
 _IMAGE_SIZE: Final = 32  # of what precedes the counts
@@ -310,8 +317,10 @@ def _cameras(listed: Sequence[_Found], *, timed: bool) -> tuple[Array, Mask, dic
         if whole:
             milliseconds[number] = whole * 1000 + (thousandths & 0xFFFF)
         # Settings and constants, which must not change after the first frame.
-        fields = {key: (order + code, body, at) for key, (at, code, *_) in _FIELDS.items()}
-        camera = {key: struct.unpack_from(*field)[0] for key, field in fields.items()}
+        camera = {
+            key: struct.unpack_from(order + code, body, start)[0]
+            for key, (start, code, *_) in _FIELDS.items()
+        }
         first = first or camera | {"body": body}
         for key in _CONSTANTS:
             if camera[key] != first[key]:

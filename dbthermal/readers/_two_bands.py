@@ -112,11 +112,13 @@ def two_bands(
     variables = schema.variables("capture", {"counts": counts, "exposure_time": times})
     variables["frame_flags"] = (("band", "time"), flags, FileFlag.cf_attrs(schema.FRAME_FLAGS))
     time = ("time", clock, schema.COORDINATES["time"].attrs)
-    files = {name: dict(it.attrs) for name, it in zip(names, cameras, strict=True)}
-    sources = [str(it.get("source", "")) for it in files.values()]
-    attrs: dict[str, Any] = schema.origin(*files.values()) | {"source": " and ".join(sources)}
-    attrs |= {"offset": shifts[1] if len(shifts) == 2 else shifts[1:], "files": files}
-    attrs["offset_by"] = "dates" if offset is None else "caller"
+    attrs = {
+        **schema.origin(*(recording.attrs for recording in cameras)),
+        "source": " and ".join(str(recording.attrs.get("source", "")) for recording in cameras),
+        "offset": shifts[1] if len(shifts) == 2 else shifts[1:],
+        "offset_by": "dates" if offset is None else "caller",
+        "files": {name: dict(it.attrs) for name, it in zip(names, cameras, strict=True)},
+    }
     capture = schema.check(xr.Dataset(variables, {"band": names, "time": time}, attrs), "capture")
     borders = map(_border, overlapping, names)
     return warned(capture, *_temperatures(overlapping), *filter(None, borders))

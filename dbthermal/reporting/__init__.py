@@ -5,7 +5,6 @@ import io
 import json
 import zlib
 from collections.abc import Iterator, Mapping
-from functools import partial
 from importlib import resources
 from itertools import cycle
 from pathlib import Path
@@ -123,18 +122,22 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
     shot = result if view.capture is None else view.capture
     chosen = _chosen(view, regions)
     shown = [name for name in view.panes if name in FILMS or name.startswith("emissivity ")]
-    curves = dict[str, dict[str, xr.Dataset]]()
-    for name, region in chosen.items():
-        curves[name] = {pane: view.curve(pane, region, pixels="measured") for pane in shown}
+    curves = {
+        name: {pane: view.curve(pane, region, pixels="measured") for pane in shown}
+        for name, region in chosen.items()
+    }
     table_ = emissivity.embedded_table() if materials is None else materials
     # Numbers of the scene, which the page holds as JSON.
     (rows, columns), frames, seconds = view.shape, view.time.size, float(np.ptp(view.time))
     sentence = f"{rows} rows of {columns} pixels, {frames} frames in {seconds:.1f} s"
     if "method" in result.attrs:
         sentence += f"; separated by the method '{result.attrs['method']}'"
-    numbers: dict[str, Any] = {"validity": _validity(view), "uncertainty": _budget(view)}
-    numbers["scene"] = {"rows": rows, "columns": columns, "frames": frames, "duration_s": seconds}
-    numbers["regions"] = {name: _summary(of, table_) for name, of in curves.items()}
+    numbers: dict[str, Any] = {
+        "scene": {"rows": rows, "columns": columns, "frames": frames, "duration_s": seconds},
+        "validity": _validity(view),
+        "uncertainty": _budget(view),
+        "regions": {name: _summary(of, table_) for name, of in curves.items()},
+    }
     made_by = result.attrs.get("provenance", {}) if provenance is None else provenance
     # What was found, by whom, and what speaks against it.
     sentences, numbers["answer"] = answer(result, table_)
@@ -146,34 +149,47 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
     emissivities = _emissivities(numbers, named=bool(regions))
     page, script = (resources.files(__package__) / name for name in ("page.html", "viewer.js"))
     environment = Environment(autoescape=True, trim_blocks=True)
-    origin = result.attrs.get("origin") or shot.attrs.get("origin", "origin not stated")
-    events = ", ".join(f"{name} ({moment:.1f} s)" for name, moment in view.events.items())
-    content: dict[str, Any] = {"title": title, "origin": origin, "answer": sentences}
-    content |= {"about": ", ".join(filter(None, about)), "scene": sentence, "events": events}
-    content |= {"logo": "" if logo is None else base64_text(_picture(logo)), "numbers": numbers}
-    content |= {"unit": unit, "zero": zero, "spread": SPREAD, "causes": schema.CAUSES}
-    content |= {"film": video(view, title, codec, celsius=celsius), "attrs": result.attrs}
-    content |= {"viewer": viewer(view, celsius=celsius), "emissivities": emissivities}
-    content["outlines"] = _svg(_outlines(view, chosen, celsius=celsius))
-    content["curves"] = _svg(_curves(view, curves, celsius=celsius))
-    content["status"] = _svg(figures.status(result)) if "status" in view.panes else ""
-    content |= {"doubts": dict.fromkeys(doubts), "percent": drawing.percent, "text": _shown}
-    content |= {"meanings": {bit.label: bit.meaning for bit in Status}}
-    content["bands"] = list(map(drawing.band_label, result["band"].values if emissivities else ()))
-    content |= {"provenance": json.dumps(made_by, indent=2, sort_keys=True)}
-    content["script"] = Markup(script.read_text("utf-8"))
-    content["json"] = partial(htmlsafe_json_dumps, allow_nan=False, sort_keys=True)
-    text = environment.from_string(page.read_text("utf-8")).render(content)
+    text = environment.from_string(page.read_text("utf-8")).render(
+        title=title,
+        origin=result.attrs.get("origin") or shot.attrs.get("origin", "origin not stated"),
+        about=", ".join(filter(None, about)),
+        answer=sentences,
+        logo="" if logo is None else base64_text(_picture(logo)),
+        numbers=numbers,
+        scene=sentence,
+        film=video(view, title, codec, celsius=celsius),
+        viewer=viewer(view, celsius=celsius),
+        outlines=_svg(_outlines(view, chosen, celsius=celsius)),
+        curves=_svg(_curves(view, curves, celsius=celsius)),
+        unit=unit,
+        zero=zero,
+        doubts=dict.fromkeys(doubts),
+        status=_svg(figures.status(result)) if "status" in view.panes else "",
+        meanings={bit.label: bit.meaning for bit in Status},
+        percent=drawing.percent,
+        causes=schema.CAUSES,
+        emissivities=emissivities,
+        bands=[drawing.band_label(band) for band in result["band"].values] if emissivities else [],
+        spread=SPREAD,
+        attrs=result.attrs,
+        events=", ".join(f"{name} ({moment:.1f} s)" for name, moment in view.events.items()),
+        text=_shown,
+        provenance=json.dumps(made_by, indent=2, sort_keys=True),
+        script=Markup(script.read_text("utf-8")),
+        json=lambda value: htmlsafe_json_dumps(value, allow_nan=False, sort_keys=True),
+    )
     store.save_text(text, path, made_by)
 
 
 def _chosen(view: View, regions: Mapping[str, Region]) -> dict[str, Region]:
     """Regions that are stated, or the whole image."""
     schema.require(regions, Mapping, "regions")
-    rule = "Must be an explorer.Region, such as Region('rectangle', ((10, 5), (40, 30)))"
     for name, region in regions.items():
         if not isinstance(region, Region):
-            raise TypeError(f"Invalid region {name!r}, {region!r}. {rule}: (row, column).")
+            raise TypeError(
+                f"Invalid region {name!r}, {region!r}. Must be an explorer.Region, such as "
+                'Region("rectangle", ((10, 5), (40, 30))) of corners (row, column).'
+            )
     whole = Region("rectangle", ((0, 0), view.shape))
     return dict(regions) or {"measured pixels of the whole image": whole}
 
@@ -245,8 +261,11 @@ def _validity(view: View) -> dict[str, float]:
     """Share of the pixels that are measured, completed, without a value, and with each flag."""
     completed = (view.status & int(schema.COMPLETED)) != 0
     film, _ = sampled(view, "object_temperature", VIEWED, VIEWED * 200_000, celsius=False)
-    shares = {"no_flag": float(np.mean(view.status == 0)), "completed": float(completed.mean())}
-    shares["without_value"] = float(film.isnull().all("time").mean())
+    shares = {
+        "no_flag": float(np.mean(view.status == 0)),
+        "completed": float(completed.mean()),
+        "without_value": float(film.isnull().all("time").mean()),
+    }
     flags = {bit.label: float(np.mean((view.status & bit) != 0)) for bit in Status}
     return shares | {name: share for name, share in flags.items() if share}
 
@@ -262,8 +281,10 @@ def _summary(curves: Mapping[str, xr.Dataset], materials: xr.Dataset) -> dict[st
         summary[name]["maximum"] = _plain(curve["mean"].max())
     bands = [name.removeprefix("emissivity ") for name in curves if name.startswith("emissivity ")]
     if bands:
-        maps = [curves[f"emissivity {band}"] for band in bands]
-        values, stds = (np.array([float(it[key]) for it in maps]) for key in ("mean", "std"))
+        values, stds = (
+            np.array([float(curves[f"emissivity {band}"][key]) for band in bands])
+            for key in ("mean", "std")
+        )
         summary["emissivity"] = dict(zip(bands, map(_plain, values), strict=True))
         summary["emissivity_std"] = dict(zip(bands, map(_plain, stds), strict=True))
         summary["nearest"] = nearest(bands, values, stds, materials)
@@ -360,6 +381,12 @@ def viewer(view: View, *, celsius: bool) -> dict[str, Any]:
     # Pixels that are completed (1), or have another flag (2).
     status = view.status[::step, ::step]
     marks = np.where((status & COMPLETED) != 0, 1, np.where(status != 0, 2, 0)).astype(np.uint8)
-    content: dict[str, Any] = {"marks": base64_text(marks.tobytes()), "quantities": quantities}
-    content |= dict(zip(("height", "width"), marks.shape, strict=True)) | {"step": step}
-    return content | {"times": time.tolist(), "palette": base64_text(colors.tobytes())}
+    return {
+        "marks": base64_text(marks.tobytes()),
+        "height": -(-view.shape[0] // step),
+        "width": -(-view.shape[1] // step),
+        "step": step,
+        "times": [float(moment) for moment in time],
+        "palette": base64_text(colors.tobytes()),
+        "quantities": quantities,
+    }
