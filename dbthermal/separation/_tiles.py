@@ -48,8 +48,8 @@ RANGE_SIGMAS: Final = 5.0  # standard deviations beyond the calibrated range tha
 USELESS: Final = 1e6  # temperature [K], emissivity [1] or deviation beyond which is no result
 BROKEN: Final = np.uint32(Status.OBJECT_NOT_SMOOTH | Status.BANDS_APART)
 """Flags of a model that does not hold: the pixel tells nothing of its material."""
-NOT_BY_ESTIMATE: Final = ~np.uint32(Status.ROLES_MAY_BE_SWAPPED)
-"""Flags but that of low emissivities: leaving those out would raise the mean of a material's."""
+LOW, LEAST_MEAN = np.uint32(Status.ROLES_MAY_BE_SWAPPED), 0.5
+"""Flag of low emissivities, and the mean of the bands below which they are."""
 
 _MAPS: Final = ("emissivity", "reflection_ratio")
 WITHOUT_STD: Final = ("object_temperature_std", "background_temperature_std", "emissivity_std")

@@ -31,7 +31,7 @@ from dbthermal.separation._pooling.pool import Image
 from dbthermal.separation._quality import Bits
 from dbthermal.separation._subspace.bars import NORMAL95
 from dbthermal.separation._subspace.reflection_ratio import energy_of_variance, principal_ratio
-from dbthermal.separation._tiles import BROKEN, NOT_BY_ESTIMATE, Mask, Material, Survey
+from dbthermal.separation._tiles import BROKEN, LOW, Mask, Material, Survey
 
 BLUR: Final = 1.0
 """Deviation of the blur of the bands whose ratios are compared [pixel]."""
@@ -131,7 +131,7 @@ def _survey(
     """Survey of some pixels by their planes, without scatter where the model is not sound."""
     status = per_pixel["status"].values.ravel()[places]
     emissivity = per_pixel["emissivity"].sel(band=per_pixel.attrs["reference_band"]).values
-    value = np.where((status & NOT_BY_ESTIMATE) == 0, emissivity.ravel()[places], np.nan)
+    value = np.where((status & ~LOW) == 0, emissivity.ravel()[places], np.nan)
     sound = ((status & BROKEN) == 0) & ~scatters.apart[places]
     scale = scatters.noise[:, places] / noise[:, np.newaxis]  # whitened by the noise of samples
     scatter = np.where(sound, scatters.scatter[..., places] * scale * scale[:, np.newaxis], 0.0)
@@ -193,7 +193,7 @@ def emissivities(inputs: Inputs, result: xr.Dataset) -> tuple[Floats, Floats]:
     """Emissivities (band, pixel) [1] that lean on neighbours', and the first band's variance."""
     raw, reference = system.first_emissivity(inputs, result), inputs.bands[0]
     variance = result["emissivity_std"].values[reference].ravel().astype(np.float64) ** 2
-    sound = ((result["status"].values.ravel() & NOT_BY_ESTIMATE) == 0) & (variance > 0)
+    sound = (result["status"].values.ravel() == 0) & (variance > 0)
     first, variance = shared(raw[0], variance, sound, result["status"].shape)
     return system.inside(1.0 - system.ratio_of(raw) * (1.0 - first)), variance
 

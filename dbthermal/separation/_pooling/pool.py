@@ -16,7 +16,7 @@ from dbthermal.schema import Status
 from dbthermal.separation._inputs import Inputs, Labels
 from dbthermal.separation._pooling import gradients
 from dbthermal.separation._subspace import reflection_ratio
-from dbthermal.separation._tiles import Array, Mask, Material, Survey
+from dbthermal.separation._tiles import LEAST_MEAN, Array, Mask, Material, Survey
 
 MOST: Final = 2048
 """Pixels of one material that are surveyed: more would not lower its systematic error."""
@@ -104,12 +104,12 @@ def materials(
     if surveys is None:
         before = None if stated is None else replace(stated, noise_variance=unknown)
         surveys = survey(inputs, before, selected)
-    per_pixel = surveys.select_pixels(places)
+    count = int(labels.max()) + 1
+    per_pixel = _usual(labels[places], count, surveys.select_pixels(places))
     if not np.any(per_pixel.frames[0] > 0):
         return None
     image = Image(labels, places, width)
     material = estimate(image, labels[places], per_pixel, noise, stated)
-    count = int(labels.max()) + 1
     conditions = per_pixel.frames[0] > 0, np.isfinite(per_pixel.emissivity)
     sound, valid = (total(labels[places], 1.0 * holds, count) for holds in conditions)
     # Pixels with an emissivity alone are a selection by their ratios: unless they are nearly all of
@@ -152,6 +152,7 @@ def estimate(
     """Ratios and emissivity at all pixels, from surveyed pixels of given labels (surveyed,)."""
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         count = int(image.labels.max()) + 1
+        survey = _usual(labels, count, survey)
         # The principal axis of the added scatters is the maximum of the likelihood, without the
         # bias of a mean of ratios. The emissivity is the mean of the pixels' emissivities,
         # corrected to these ratios.
@@ -165,6 +166,15 @@ def estimate(
             variance = np.where(stated, material.inverse_energy, image.expand(ratio_set.variance))
             common = Material.of_ratios(ratio, variance, material.spread)
         return _material(image, common, used, survey)
+
+
+def _usual(labels: Labels, count: int, survey: Survey) -> Survey:
+    """Survey with low emissivities only of materials in which they are the rule."""
+    # Elsewhere they are errors; without them where they are the rule, the errors alone would count.
+    value = survey.emissivity
+    low = np.mean(1.0 - survey.ratio * (1.0 - value), axis=0) < LEAST_MEAN
+    balance = total(labels, low * 1.0 - (np.isfinite(value) & ~low), count)
+    return replace(survey, emissivity=np.where(low & (balance[labels] <= 0.0), np.nan, value))
 
 
 def _sound(labels: Labels, count: int, survey: Survey, noise: Array) -> tuple[Ratios, Labels, Mask]:

@@ -64,7 +64,7 @@ from dbthermal.separation._inputs import Method, check_fields
 from dbthermal.separation._quality import status_bits
 from dbthermal.separation._subspace import division, fused, pieces, reflection_ratio
 from dbthermal.separation._subspace.fused import FILMS, Solution
-from dbthermal.separation._tiles import BROKEN, NOT_BY_ESTIMATE, Estimate, Mask, Tile, Whole
+from dbthermal.separation._tiles import BROKEN, LEAST_MEAN, LOW, Estimate, Mask, Tile, Whole
 
 # Thresholds of the flags, in standard deviations.
 _CONTRAST_SIGMAS: Final = 8.0
@@ -197,7 +197,7 @@ def _report(tile: Tile, solution: Solution) -> Estimate:
     exchanged = (status & np.uint32(Status.ROLES_MAY_BE_SWAPPED)) != 0
     exchanged &= (status & _HARDLY_CHANGES) != 0
     sound = ((status & BROKEN) == 0) & ~exchanged
-    return replace(result, survey=solution.survey(sound, (status & NOT_BY_ESTIMATE) == 0))
+    return replace(result, survey=solution.survey(sound, (status & ~LOW) == 0))
 
 
 def _flags(tile: Tile, solution: Solution) -> dict[Status, Mask]:
@@ -212,7 +212,7 @@ def _flags(tile: Tile, solution: Solution) -> dict[Status, Mask]:
     gray = ~still & (singular | solution.gray)
     defined = ~still & ~gray & ~solution.constant
     nonphysical = defined & np.any((emissivity <= 0) | (emissivity >= 1), axis=0)
-    swapped = defined & ~nonphysical & (emissivity.mean(axis=0) < 0.5)
+    swapped = defined & ~nonphysical & (emissivity.mean(axis=0) < LEAST_MEAN)
     constant = ~still & ~gray & solution.constant
     # Before an object that hardly changes, what changes would be the background: comes and goes.
     resting = constant | (nonphysical & (solution.noise_variance > _UNKNOWN**2))
