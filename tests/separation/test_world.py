@@ -32,6 +32,11 @@ WORLDS: dict[str, tuple[World, str, str]] = {
     "rough surface": (World(roughness=(2.0, 2.8)), "not equally sharp", ""),
     "second camera sharper": (World(blur=(1.2, 0.4)), "not equally sharp", ""),
     "metal beside paint": (World(surface=(METAL, (0.93, 0.82))), "", ""),
+    "bare metal, apart": (
+        World(parallax=2.0, noise=(0.02, 0.03), surface=((0.37, 0.30), (0.86, 0.72))),
+        "",
+        "",
+    ),
     "lock-in": (World(lamp=0.3), "", ""),
     "foil": (World(behind=(0.10, 0.15), surface=(PLASTIC, PLASTIC)), "", ""),
     "one way": (World(together=True, parallax=3.0), "", ""),
