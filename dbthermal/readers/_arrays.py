@@ -123,7 +123,7 @@ def array(
     fills = [float(fill) % 2**16 for fill in fills] if read.dtype.kind == "i" else fills
     _recording.check_present(counts, fills, label)
     low, high = attributes["valid_range"]
-    if counts.min() < low or counts.max() > high:
+    if low < high and (counts.min() < low or counts.max() > high):  # else it is no range
         rule = f"Must lie within valid_range, {low:g} to {high:g}: beyond, none was measured"
         raise ValueError(f"Invalid counts of '{label}', {counts.min()} to {counts.max()}. {rule}.")
     sentences = [it for rate in rates for it in _recording.another_rate(rate, stamps, label)]

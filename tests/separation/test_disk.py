@@ -304,6 +304,7 @@ def test_kill_and_restart(path: Path, tmp_path: Path) -> None:
     assert files(target) == files(tmp_path / "rest.zarr")
 
 
+@pytest.mark.filterwarnings("ignore:Invalid samples in all")
 def test_parts_of_another_run_are_refused(path: Path, tmp_path: Path) -> None:
     """What a run of other options has left is not taken for this one's."""
     target = tmp_path / "result.zarr"
