@@ -123,10 +123,10 @@ class Disk:
     def sync(self, file: int) -> None:
         """Bring to the disk what an open file or folder has in it now."""
         status = os.fstat(file)
+        self.kept.append(os.dup(file))  # so that its number is not given away
         if stat.S_ISDIR(status.st_mode):
             self.names[status.st_ino] = listed(file)
         else:
-            self.kept.append(os.dup(file))  # so that the file's number is not given away
             self.contents[status.st_ino] = os.pread(file, status.st_size, 0)
 
     def power_loss(self, remains: Path, *, early: bool) -> None:
