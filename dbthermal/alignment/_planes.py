@@ -39,8 +39,8 @@ _BLUR: Final = 2.0  # before a displacement is looked for [pixel]
 # Chance below which, and pixels or frames from which, so many windows or more are displaced.
 _CHANCE, _LEAST, _LEAST_LATE, _FEWEST = 1e-3, 0.3, 0.1, 4
 # Share of a band's changes that the other does not explain. Of displaced cameras whose shift the
-# step does not see: 0.018 to 0.8, in 10 of 11 scenes above this; at one place 0 to 0.016 in 44 of
-# 50, at most 0.07. A search in vain costs time alone.
+# step does not see: 0.018 to 0.85, in 11 of 12 scenes above this; at one place 0 to 0.016 in 50 of
+# 56, at most 0.066. A search in vain costs time alone.
 _UNEXPLAINED: Final = 0.02
 _STRONG: Final = 3.0  # variance of a window's changes over the noise
 # Functions of time, of a smooth object at most, and of what changes rapidly; pixels that tell them.
@@ -209,7 +209,7 @@ def _frames(counts: xr.DataArray) -> npt.NDArray[np.intp]:
 
 
 def displaced_windows(corrected: xr.Dataset, scale: Scale) -> tuple[bool, float]:
-    r"""Whether the bands may show rapid changes displaced; share of windows that do, 0 by chance.
+    r"""Tell whether the cameras may see reflections displaced, and in which share of windows.
 
     A Gauss-Newton step from no displacement [1] matches the windows, of changes that no smooth
     object shows; and once more of those too rapid for an object that heats within seconds:
@@ -302,7 +302,7 @@ def _window_equations(corrected: xr.Dataset, scale: Scale) -> Iterator[tuple[Arr
             planes = np.tensordot(film, function.astype(np.float32), (1, 0))
             first, second = images.splines(planes[0], _BLUR), images.blurred(planes[1], _BLUR)
             pairs = images.products(first, [second], places, rate.astype(np.float32))[0].sum(axis=0)
-            within = (slice(left, left + side) for left in lefts - columns.start)
+            within = (slice(start, start + side) for start in lefts - columns.start)
             block.extend(pairs[window].sum(axis=0) for window in within)
     # Noise of variance s^2, blurred by b: s^2 / (4 pi b^2), of a slope 1 / (2 b^2) of that.
     levels, slope = side**2 * noise[bands] ** 2 / (4.0 * np.pi * _BLUR**2), 0.5 / _BLUR**2

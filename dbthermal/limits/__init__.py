@@ -309,8 +309,8 @@ def plan(
         stds = _fisher.deviations(sensitivity, truth.time, order, reference=0)
         # One number for all frames: the root of their mean square. A free background is measured
         # by its frame alone.
-        alone = 0.0 * sensitivity.free, (stride - 1.0) * sensitivity.free
-        for name, variance in zip(_fisher.TEMPERATURES, alone, strict=True):
+        of_frames = 0.0 * sensitivity.free, (stride - 1.0) * sensitivity.free
+        for name, variance in zip(_fisher.TEMPERATURES, of_frames, strict=True):
             stds[name] = np.sqrt(np.mean(stds[name] ** 2 + variance, axis=0))
         stds["condition_number"] = mixing.condition_number(truth.emissivity.T)
         cases.append(stds)

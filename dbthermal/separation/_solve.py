@@ -382,8 +382,8 @@ def _write(
             elif complete and np.all(frames) and np.all(pixels):
                 target[...] = values.reshape(target.shape)
             else:  # NaN at frames and samples that are not valid
-                films, selected = np.full(cut.valid.shape, np.nan, np.float32), pixels.nonzero()[0]
-                films = films[:, selected]
+                selected = np.flatnonzero(pixels)
+                films = np.full((frames.size, selected.size), np.nan, np.float32)
                 films[frames] = values
                 films[~cut.valid[:, selected]] = np.nan
                 target[:, *np.divmod(selected, shape[1])] = films

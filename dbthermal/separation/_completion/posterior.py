@@ -76,14 +76,14 @@ class Mixture:
         """Prior of the libraries, of a material of the table, or of the user; see `complete`."""
         if prior is None:
             table = emissivity.library_mixture(bands)
-            parts = (table[name].values[..., np.newaxis] for name in ("mean", "covariance"))
-            return cls(table["weight"].values, *parts)
+            arrays = (table[name].values[..., np.newaxis] for name in ("mean", "covariance"))
+            return cls(table["weight"].values, *arrays)
         if isinstance(prior, str):
-            known = emissivity.embedded_table()["emissivity"]
-            if prior not in known["material"]:
-                names = known["material"].values.tolist()
+            materials = emissivity.embedded_table()["emissivity"]
+            if prior not in materials["material"]:
+                names = materials["material"].values.tolist()
                 raise ValueError(f"Unknown prior '{prior}'. Must be one of {names}.")
-            prior = known.sel(material=prior)
+            prior = materials.sel(material=prior)
         stds = np.full(len(bands), _SAMPLE_STD)
         if isinstance(prior, xr.Dataset):
             if missing := {"emissivity", "emissivity_std"} - set(prior):
@@ -93,10 +93,10 @@ class Mixture:
             prior, std = prior["emissivity"], prior["emissivity_std"]
             stds = schema.band_values(std, bands, "emissivity_std of the prior", "1")
         values = schema.band_values(prior, bands, "prior", "1")
-        for name, part in (("emissivities", values), ("emissivity_std", stds)):
-            if not np.all((part > 0) & (part < 1)):
+        for name, numbers in (("emissivities", values), ("emissivity_std", stds)):
+            if not np.all((numbers > 0) & (numbers < 1)):
                 raise ValueError(
-                    f"Invalid {name} {part.tolist()} of the prior. Must lie in (0, 1)."
+                    f"Invalid {name} {numbers.tolist()} of the prior. Must lie in (0, 1)."
                 )
         return cls(np.ones(1), values[None, :, None], np.diag(stds**2)[None, ..., None])
 

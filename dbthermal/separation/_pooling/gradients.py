@@ -68,7 +68,7 @@ class Gradient:
     degree: int
     value: Array  # at the places asked for (place,)
     variance: Array  # of it, without a spread (place,)
-    left: tuple[Cost, ...]  # in single pixels, and in squares of some
+    remainders: tuple[Cost, ...]  # in single pixels, and in squares of some
 
 
 def fit(measured: Places, asked: Places, cost: Cost) -> Gradient:
@@ -106,15 +106,15 @@ def fit(measured: Places, asked: Places, cost: Cost) -> Gradient:
     functions, inverse, _, _ = fits[more]
     covariance = _covariance(functions, inverse, variance if chosen else cost.variance)
     at = powers(asked, measured, more)
-    left = replace(cost, linear=residual)
+    remainder = replace(cost, linear=residual)
     side = max(1, round(np.sqrt(_TOGETHER * asked[0].size / pixels)))
-    lefts = left, left.over_squares(measured, side)
-    return Gradient(chosen, value, np.einsum("pi,ij,pj->p", at, covariance, at), lefts)
+    remainders = remainder, remainder.over_squares(measured, side)
+    return Gradient(chosen, value, np.einsum("pi,ij,pj->p", at, covariance, at), remainders)
 
 
 def spreads(fits: list[Gradient]) -> list[float]:
     """Variance of single pixels, or of squares of pixels, about each gradient; 0 where not seen."""
-    scales = [_spreads([fit.left[scale] for fit in fits]) for scale in range(2)]
+    scales = [_spreads([fit.remainders[scale] for fit in fits]) for scale in range(2)]
     return [max(pair) for pair in zip(*scales, strict=True)]
 
 
@@ -154,10 +154,10 @@ def step(
         # design = Q R: h = q^T f / r with q, r the last column and corner, var(h) = 1 / r^2.
         basis, triangle = np.linalg.qr(root[:, np.newaxis] * design)
         heights = (root * value) @ basis
-        left = np.sum((root * value) ** 2) - np.sum(heights**2)
-        result.append((left, heights[-1] ** 2, abs(triangle[-1, -1])))
-    left, square, sharpness = np.array(result).T
-    return left, square, sharpness
+        chi2 = np.sum((root * value) ** 2) - np.sum(heights**2)
+        result.append((chi2, heights[-1] ** 2, abs(triangle[-1, -1])))
+    chi2, square, sharpness = np.array(result).T
+    return chi2, square, sharpness
 
 
 def continuous(places: Places, values: Array, variances: Array, second: Mask, least: Array) -> bool:
@@ -167,10 +167,10 @@ def continuous(places: Places, values: Array, variances: Array, second: Mask, le
         functions = (degree + 1) * (degree + 2) // 2
         if second.size < _ENOUGH * (functions + 1):
             break
-        left, square, sharpness = step(places, values, variances, second, degree)
+        remainder, square, sharpness = step(places, values, variances, second, degree)
         # The least step (map,) must be one that would be seen at three standard deviations.
         seen = np.all((least == 0.0) | (sharpness * least > _SIGMAS))
-        chi2 = left.sum() + np.array([square.sum(), 0.0])  # without a step, and with one
+        chi2 = remainder.sum() + np.array([square.sum(), 0.0])  # without a step, and with one
         coefficients = len(values) * (functions + np.arange(2))
         criteria = chi2 + coefficients * np.log(second.size)
         # The lowest Bayesian information criterion decides, if it leaves no more than noise.

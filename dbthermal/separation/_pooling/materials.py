@@ -321,8 +321,8 @@ def _links(
         least = _LEAST_STEP * np.abs(np.mean(change.ravel()[pixels]))
         where, second = np.divmod(pixels, cells.shape[1]), np.arange(pixels.size) >= first.size
         variance = np.repeat(noise[:, pixels].mean(axis=1)[:, np.newaxis], pixels.size, axis=1)
-        left, square, sharpness = gradients.step(where, values[:, pixels], variance, second, _CUBIC)
-        smooth = left <= chdtri(pixels.size - _COEFFICIENTS, _BORDER_RATE)
+        chi2, square, sharpness = gradients.step(where, values[:, pixels], variance, second, _CUBIC)
+        smooth = chi2 <= chdtri(pixels.size - _COEFFICIENTS, _BORDER_RATE)
         if np.all(smooth & (least * sharpness >= _VISIBLE)):
             steps[index] = square.sum()
     unbroken = steps < chdtri(len(emitted), _STEP_RATE)

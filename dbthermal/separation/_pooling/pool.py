@@ -65,10 +65,12 @@ class Image:
         """Values (..., material) at each pixel (..., pixel); NaN at those without a material."""
         return np.where(self.labels >= 0, values[..., self.labels], np.nan)
 
-    def gradient(self, label: int, known: Labels, cost: gradients.Cost) -> gradients.Gradient:
+    def gradient(self, label: int, measured: Labels, cost: gradients.Cost) -> gradients.Gradient:
         """Gradient at all pixels of a label, from some that are surveyed, see `gradients.fit`."""
         asked = np.flatnonzero(self.labels == label)
-        start, places = (np.divmod(pixels, self.width) for pixels in (self.surveyed[known], asked))
+        start, places = (
+            np.divmod(pixels, self.width) for pixels in (self.surveyed[measured], asked)
+        )
         return gradients.fit(start, places, cost)
 
 

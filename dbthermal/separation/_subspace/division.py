@@ -62,7 +62,7 @@ class Joining(NamedTuple):
     before: Whole  # edge before each one, of the least cost
     middle: Array  # of each part [s], half its length [s], and its energy beside polynomials (part)
     half: Array
-    beside: Array
+    remainder: Array
     products: Array  # with the polynomials of each part (part, degree)
     centre: Array  # of each polynomial's square, in half lengths from the middle (part, degree)
     length: Array  # of each polynomial (part, degree)
@@ -130,9 +130,9 @@ def divide(white: Array, time: Array, segment: Whole | None, stated: Array) -> t
 def _joining(most: int, event: Mask) -> Joining:
     """Work space for pieces that may begin with so many frames, at most."""
     events, degrees = int(event.sum()), pieces.FUNCTIONS
-    parts, functions = most + events + event.size // _LONGEST, degrees + events
-    counts = parts + 1, most + 1, most + 1
-    curves = parts, parts, parts, (parts, degrees), (parts, degrees), (parts, degrees)
+    count, functions = most + events + event.size // _LONGEST, degrees + events
+    counts = count + 1, most + 1, most + 1
+    curves = count, count, count, (count, degrees), (count, degrees), (count, degrees)
     basis, equations = (degrees, _LONGEST), (functions, functions)
     shapes = *curves, basis, equations, functions, (degrees, degrees), functions, most + 1
     arrays: list[Any] = [np.empty(count, np.intp) for count in counts]
@@ -178,9 +178,9 @@ def _of_level(time: Array, edges: Whole) -> Iterator[tuple[Array, int]]:
     step = max(1, _TOGETHER * (len(edges) - 1) // time.size)
     for group in range(0, len(edges) - 1, step):
         bounds, start = edges[group : group + step + 1], 0
-        part = time[bounds[0] : bounds[-1]]
+        span = time[bounds[0] : bounds[-1]]
         first = np.isin(np.arange(bounds[0], bounds[-1]), bounds)
-        columns = smooth.piecewise(part, first, np.empty((part.size, 0))).functions
+        columns = smooth.piecewise(span, first, np.empty((span.size, 0))).functions
         for begin, stop in zip(bounds[:-1] - bounds[0], bounds[1:] - bounds[0], strict=True):
             order = min(smooth.PIECE_ORDER, stop - begin)
             basis = np.ascontiguousarray(columns[begin:stop, start : start + order])
@@ -343,7 +343,7 @@ def _part(time: Array, curve: Array, scratch: Joining, number: int) -> None:
         scratch.centre[number, k], scratch.length[number, k] = a, sqrt(square)
         scratch.products[number, k] = held / sqrt(square)
     scratch.middle[number], scratch.half[number] = middle, half
-    scratch.beside[number] = energy if size > pieces.FUNCTIONS else 0.0
+    scratch.remainder[number] = energy if size > pieces.FUNCTIONS else 0.0
 
 
 @compiled
@@ -371,7 +371,7 @@ def _powers(scratch: Joining, number: int, end: float) -> None:
 def _add(scratch: Joining, number: int, end: float, steps: int) -> float:
     """Add a part to the equations of a piece that ends at a time [s]; return the energy left."""
     matrix, right, row = scratch.equations, scratch.right, scratch.row
-    energy, count = scratch.beside[number], pieces.FUNCTIONS + steps
+    energy, count = scratch.remainder[number], pieces.FUNCTIONS + steps
     _powers(scratch, number, end)
     for j in range(pieces.FUNCTIONS):
         for k in range(count):
@@ -418,15 +418,15 @@ def _join(time: Array, event: Mask, across: Array, scratch: Joining, begins: Mas
     for stop in range(1, count + 1):
         least[stop], before[stop] = np.inf, 0
         scratch.equations[:], scratch.right[:] = 0.0, 0.0
-        number, steps, left, end = edges[stop], 0, 0.0, begun[edges[stop]]
+        number, steps, remainder, end = edges[stop], 0, 0.0, begun[edges[stop]]
         for start in range(stop - 1, -1, -1):
             while number > edges[start]:
                 steps += 1 if number < edges[stop] and event[begun[number]] else 0
                 number -= 1
-                left += _add(scratch, number, time[end - 1], steps)
+                remainder += _add(scratch, number, time[end - 1], steps)
             size = end - begun[number]
             functions = pieces.FUNCTIONS if size > smooth.PIECE_ORDER else size - steps
-            energy = left if functions + steps < size else 0.0
+            energy = remainder if functions + steps < size else 0.0
             total = least[start] + energy + pieces.COST * (functions + steps)
             if total < least[stop] + pieces.TIE:
                 least[stop], before[stop] = min(total, least[stop]), start
