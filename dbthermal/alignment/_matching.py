@@ -6,6 +6,7 @@ much later the others show what the first shows.
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -47,7 +48,6 @@ class Movies:
     valid: Mask  # pixels (y, x) with data in all
     noise: Array  # standard deviation of a sample before the blur, first and others [K]
     freedom: float  # degrees of freedom of a pixel's noise
-    outside: float  # degrees of freedom of whole frames over these [1]
     factor: int  # pixels of the capture along a side of a pixel here
 
     @classmethod
@@ -58,7 +58,6 @@ class Movies:
         noise: Array,
         freedom: float,
         factor: int,
-        whole: float,
     ) -> "Movies":
         """Movies of pixels that are so many times coarser than the mask's."""
         mostly = images.binned(valid.astype(np.float64), factor) > 0.5
@@ -71,8 +70,7 @@ class Movies:
             noise = np.minimum(noise, np.array(usual) / white)
         first = images.splines(movies[0], BLUR)
         others = [images.blurred(movie, BLUR) for movie in movies[1:]]
-        outside = max(whole / freedom, 1.0)
-        return cls(first, others, mostly, noise / factor, freedom, outside, factor)
+        return cls(first, others, mostly, noise / factor, freedom, factor)
 
     def centres(self) -> list[Array]:
         """Rows and columns, of the capture, of the pixels' centres."""
@@ -131,30 +129,32 @@ def _information(movies: Movies, shift: Array) -> Information:
 
     .. math:: A = k^2 \sum_t g g^T / s^2, \quad b = k \sum_t g r / s^2
 
-    less what noise makes of the slopes; s^2 is the noise's variance where the residual is noise,
-    and larger where it is not.
+    less what noise makes of the slopes; s^2 is the variance of r along g in the window, as of a
+    sandwich estimator (White 1980, doi:10.2307/1912934), and not less than the noise's.
     """
     places, used = movies.pairs(shift)
     noise = movies.noise[0] * _VALUE_NOISE
     total = np.zeros((*used.shape, 6))
-    number = np.maximum(gaussian_filter(used * movies.freedom, WINDOW), 1e-9)
+    window = partial(gaussian_filter, sigma=WINDOW)
+    number = np.maximum(window(used * movies.freedom), 1e-9)
     moments = images.products(movies.first, movies.others, places) * used[..., np.newaxis]
     for sums, level in zip(moments, movies.noise[1:], strict=True):
-        mm, my, mx, mh, yy, yx, yh, xx, xh, hh = np.moveaxis(sums, 2, 0)
+        _, my, mx, _, yy, yx, yh, xx, xh, _ = np.moveaxis(sums, 2, 0)
         auto, terms = np.moveaxis(images.blurred(sums[..., [0, 3]], WINDOW), 2, 0)
         # Noise of the moved movie makes its energy larger, not its product with another movie.
         auto -= number * noise**2
         ratio = terms / np.maximum(auto, 0.1 * number * noise**2)
         # Summed over pixels, the noise is that before the blur.
         variance = level**2 + (ratio * movies.noise[0]) ** 2
-        residual = gaussian_filter(hh - 2.0 * ratio * mh + ratio**2 * mm, WINDOW)
-        # Over the freedom of whole frames: what lies outside the planes is noise.
-        excess = residual / (variance * _VALUE_NOISE**2) - number
-        misfit = np.maximum(1.0 + excess / (number * movies.outside), 1.0)
+        # Residuals along the slopes, over what noise makes of them. A residual in the movie's own
+        # functions of time moves the field most: a border of materials before a lamp, that has one.
+        force = np.stack([yh - ratio * my, xh - ratio * mx])
+        expected = variance * _VALUE_NOISE**2 * np.maximum(window((yy + xx) * used), 1e-300)
+        misfit = np.maximum(window((force**2).sum(axis=0) * used) / expected, 1.0)
         weight = used * ratio / (misfit * variance)
         less = ratio * movies.freedom * (movies.noise[0] * _SLOPE_NOISE) ** 2
         squares = ratio * yy - less, ratio * yx, ratio * xx - less
-        terms = np.stack([*squares, yh - ratio * my, xh - ratio * mx, less], axis=-1)
+        terms = np.stack([*squares, *force, less], axis=-1)
         total += weight[..., np.newaxis] * terms
     total = np.moveaxis(images.blurred(total, WINDOW), 2, 0)
     tensor, gradient, less = total[:3], total[3:5], total[5]
