@@ -18,6 +18,8 @@ Whole = npt.NDArray[np.intp]
 
 HIGHEST_ORDER: Final = 14  # of a smooth subspace that data may choose
 PIECE_ORDER: Final = 5  # number of polynomials in a piece of time
+# Of slow noise: powers of time's functions, and white noise over it.
+_POWERS, _WHITES = np.linspace(0.0, 2.0, 9), (0.0, 0.1, 1.0, 10.0)
 # Functions that a change point costs as much as: to choose where the polynomial changes fits noise,
 # too (Ninomiya 2015, doi:10.1007/s10463-014-0481-x). Half of them on either side.
 CHANGE_POINT: Final = 3.0
@@ -99,6 +101,26 @@ def largest(
 ) -> Subspace:
     """Largest smooth subspace that data may choose, see `subspace`."""
     return subspace(time, min(HIGHEST_ORDER, time.size // 4), segment=segment)
+
+
+def rapid(time: Array) -> tuple[Array, int]:
+    """Functions (time, function) three octaves above the smooth ones, and the number of these."""
+    first = min(HIGHEST_ORDER, time.size // 4)
+    return polynomial_basis(time, min(8 * first, 3 * time.size // 4))[:, first:], first
+
+
+def energy_below(squares: Array, first: int) -> Array:
+    """Expected sum of squares below the `first` function, of those above (function, direction).
+
+    Variances are A (j^-b + r) in function j: white noise to a random walk, b = 2, by likelihood.
+    """
+    order = np.arange(1.0, first + len(squares))
+    shapes = np.array([order**-b + r * first**-b for b in _POWERS for r in _WHITES])
+    below, above = np.split(shapes, [first - 1], axis=1)
+    size = np.mean(squares / above[..., np.newaxis], axis=1) + np.finfo(float).tiny
+    likely = -0.5 * (np.log(above).sum(axis=1)[:, np.newaxis] + len(squares) * np.log(size))
+    weights = np.exp(likely - likely.max(axis=0))
+    return np.asarray(np.average(size * below.sum(axis=1, keepdims=True), 0, weights))
 
 
 def piecewise(

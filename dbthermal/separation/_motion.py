@@ -60,8 +60,6 @@ _LEAST: Final = 0.1  # motion of a band that matters, rms [pixel]: two depths fe
 _SIDES, _AROUND, _SAMPLES = (8, 32), 6, 2**24
 _TURNS, _STEP, _SETTLED = 6, 2.0, 0.02
 _SEARCHED, _REPEATS = 2, 2  # turns in which ratios are sought, and rounds of the weights
-# Of noise that whole frames have in common: powers of time's functions, and white noise over it.
-_POWERS, _WHITES = np.linspace(0.0, 2.0, 9), (0.0, 0.1, 1.0, 10.0)
 # Ratios that are tried, of reflectivities; and the variance over that of noise of a pixel that
 # counts half.
 _RATIOS: Final = np.exp(np.append(np.linspace(-1.2, -0.15, 4), np.linspace(0.15, 1.5, 9)))
@@ -146,8 +144,7 @@ def _levels(inputs: Inputs, misfit: Misfit) -> tuple[Array, Array]:
     shape = shape @ np.linalg.eigh(shape @ form.sum(axis=0) @ shape)[1]
     form, force = (shape.T @ form @ shape)[:, np.newaxis], np.swapaxes(force, 1, 2) @ shape
     # Functions of time above the smooth ones tell levels along directions of the bands' noise.
-    first = min(smooth.HIGHEST_ORDER, time.size // 4)
-    functions = smooth.polynomial_basis(time, min(8 * first, 3 * time.size // 4))[:, first:]
+    functions, first = smooth.rapid(time)
     steps, variance = jackknife(form, functions.T @ force, prior, np.zeros((1, len(bands))))
     score = np.median(quotient(steps**2, variance, 0.0)[:first], axis=0)
     shape = shape * (score > SURE)
@@ -155,22 +152,10 @@ def _levels(inputs: Inputs, misfit: Misfit) -> tuple[Array, Array]:
         np.zeros((len(inputs.noise), size)) for size in (time.size, len(inputs.noise))
     )
     levels[bands] = shape @ solved(form.sum(axis=0) + prior, force.sum(axis=0)).T
-    wander[np.ix_(bands, bands)] = shape * _below(steps**2, first) / time.size @ shape.T
+    wander[np.ix_(bands, bands)] = (
+        shape * smooth.energy_below(steps**2, first) / time.size @ shape.T
+    )
     return levels, wander
-
-
-def _below(squares: Array, first: int) -> Array:
-    """Expected sum of squares below the `first` function, of those above (function, direction).
-
-    Variances are A (j^-b + r) in function j: white noise to a random walk, b = 2, by likelihood.
-    """
-    order = np.arange(1.0, first + len(squares))
-    shapes = np.array([order**-b + r * first**-b for b in _POWERS for r in _WHITES])
-    below, above = np.split(shapes, [first - 1], axis=1)
-    size = np.mean(squares / above[..., np.newaxis], axis=1) + np.finfo(float).tiny
-    likely = -0.5 * (np.log(above).sum(axis=1)[:, np.newaxis] + len(squares) * np.log(size))
-    weights = np.exp(likely - likely.max(axis=0))
-    return np.asarray(np.average(size * below.sum(axis=1, keepdims=True), 0, weights))
 
 
 class _Window(NamedTuple):

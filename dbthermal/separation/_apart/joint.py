@@ -153,12 +153,17 @@ class Joint:
             gaussian_filter1d(curves, 1.0, axis=axis, order=1) * component.astype(np.float32)
             for axis, component in zip((1, 2), off, strict=True)
         ]
-        # Without a solution x(p) was taken for x(r): they differ as at the nearest solution.
+        # Without a solution x(p) was taken for x(r): they differ as at the nearest solution, and
+        # farther off by as much more as the difference changes where it is solved.
         unsolved = np.isnan(self.signals[0]).all(axis=0).reshape(status.shape)
-        near = distance_transform_edt(unsolved, return_distances=False, return_indices=True)
-        square = np.mean((self.signals[1] - self.signals[0]) ** 2, axis=0).reshape(status.shape)
+        distance, near = distance_transform_edt(unsolved, return_indices=True)
+        films = self.signals[:, looked_at(self.signals.shape[1])].reshape(2, -1, *status.shape)
+        apart = films[1] - films[0]
+        steps = [np.diff(apart, axis=axis) ** 2 for axis in (1, 2)]
+        growth = sum(step.mean(where=np.isfinite(step)) for step in steps)
+        square = (apart**2).mean(axis=0)[near[0], near[1]] + growth * distance**2
         share = (weights * self.emissivity)[1:].sum(0).reshape(status.shape)
-        square = np.nan_to_num(unsolved * share**2 * square[near[0], near[1]])
+        square = np.nan_to_num(unsolved * share**2 * square)
         factor = self.factor(threads).reshape(status.shape)
 
         def widen(rows: slice) -> None:
