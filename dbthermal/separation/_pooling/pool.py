@@ -277,7 +277,8 @@ def _outliers(
         whole = np.moveaxis(scatter + frames * np.eye(len(noise))[..., np.newaxis], -1, 0)
         pixel_ratio = np.where(rapid, reflection_ratio.principal_ratio(whole, noise), survey.ratio)
         inverse = reflection_ratio.inverse_energy(scatter, pixel_ratio, noise, frames)
-        variance = reflection_ratio.ratio_variance(pixel_ratio, inverse + common.spread, noise)
+        inverse = inverse + common.inverse_energy + common.spread
+        variance = reflection_ratio.ratio_variance(pixel_ratio, inverse, noise)
         score = np.max((np.abs(pixel_ratio - common.ratio) / np.sqrt(variance))[1:], axis=0)
         score = np.where(labels >= 0, np.nan_to_num(score), 0.0)
         farthest = np.zeros(len(material.rapid))
@@ -287,8 +288,7 @@ def _outliers(
         # By the deviation of the material's ratio in the pixel, too: near black, pixels that tell
         # little have ratios of a wide and skew distribution.
         result |= distant & ~reflection_ratio.agrees(whole, whitened)
-    informed = np.isfinite(material.variance[labels])
-    return np.asarray(result & informed & (survey.frames[0] > 0) & (labels >= 0))
+    return np.asarray(result & np.isfinite(material.variance[labels]) & (survey.frames[0] > 0))
 
 
 def _with_gradients(
