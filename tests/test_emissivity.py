@@ -222,6 +222,18 @@ def test_embedded_table_is_whole() -> None:
         assert credit in text
 
 
+def test_tables_lack_a_new_filter(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A filter without columns in the packaged tables raises an error that names table and rule."""
+    wide = {**FILTERS, "8.6": Band("8.6", 8e-6, 9.2e-6)}
+    monkeypatch.setattr(emissivity, "FILTERS", wide)
+    for call, table in (
+        (emissivity.embedded_table, "table"),
+        (lambda: emissivity.library_mixture(["8-14"]), "mixture"),
+    ):
+        with pytest.raises(ValueError, match=f"of 'emissivity_{table}.csv'. Must begin with .*8.6"):
+            call()
+
+
 @pytest.mark.data
 def test_embedded_table_from_the_libraries(spectra: dict[str, xr.Dataset]) -> None:
     """Each row is what the libraries give, to its last decimal."""

@@ -140,10 +140,8 @@ def embedded_table() -> xr.Dataset:
     >>> embedded_table().emissivity.sel(material="plate window glass", band="9.5").item()
     0.718
     """
-    titles, rows = _packaged(_TABLE)
     names = ["material", "library", "source"]
-    if titles != [*names, *FILTERS, "coverage_8_14"]:
-        raise ValueError(f"Invalid columns {titles} of '{_TABLE}'. Must be those of the filters.")
+    _, rows = _packaged(_TABLE, [*names, *FILTERS, "coverage_8_14"])
     values = _text.numbers([(line, row[3:]) for line, row in rows], len(FILTERS) + 1, _TABLE)
     # The four filters end at 12.35 um: every spectrum of the table covers them whole.
     coverage = np.ones_like(values[:, :-1])
@@ -183,7 +181,7 @@ def library_mixture(bands: Iterable[str]) -> xr.Dataset:
         label = f"Invalid bands {names} of the library's emissivities. Must be of {[*FILTERS]}"
         rule = "each once, when the capture is made; or give a prior on the emissivities"
         raise ValueError(f"{label}, {rule}.")
-    titles, rows = _packaged(_MIXTURE)
+    titles, rows = _packaged(_MIXTURE, ["weight", *FILTERS, f"{CAMERA_BAND} {CAMERA_BAND}"])
     count, values = len(FILTERS), _text.numbers(rows, len(titles), _MIXTURE)
     covariance = np.zeros((len(values), count, count))
     i, j = np.tril_indices(count)
@@ -203,10 +201,12 @@ def library_mixture(bands: Iterable[str]) -> xr.Dataset:
     return xr.Dataset(variables, {"band": names, "other": names})
 
 
-def _packaged(name: str) -> tuple[list[str], list[_text.Row]]:
-    """Titles and rows of a table that comes with the package."""
+def _packaged(name: str, columns: list[str]) -> tuple[list[str], list[_text.Row]]:
+    """Titles and rows of a table that comes with the package; its first columns are named."""
     with resources.as_file(resources.files("dbthermal.emissivity").joinpath(name)) as path:
         (_, titles), *rows = _text.table_rows(_text.read_text(path), name, comment="#")
+    if titles[: len(columns)] != columns:  # a filter was added
+        raise ValueError(f"Invalid columns {titles} of '{name}'. Must begin with {columns}.")
     return titles, rows
 
 

@@ -92,7 +92,7 @@ class Frame:
     """A frame as it came: its counts are not written to again, a leap of the number is a loss."""
 
     counts: Counts  # raw signal (y, x) [count]
-    device_time: float  # exposure, by the camera's or the kernel's stamp [s]; NaN without a stamp
+    device_time: float  # exposure, by the camera's or the kernel's stamp [s]; NaN: no measurement
     host_time: float  # arrival, on the host's monotonic clock [s]
     sequence: int  # number that the driver gives each frame
     flags: FrameFlag = GOOD  # damage, and kind of its clock
