@@ -9,7 +9,7 @@ from itertools import groupby
 from pathlib import Path
 from tempfile import gettempdir
 from typing import Any, Final
-from warnings import catch_warnings
+from warnings import catch_warnings, filterwarnings
 
 import numpy as np
 import xarray as xr
@@ -259,7 +259,8 @@ def _described(paths: list[Path], options: Namespace, camera: int) -> dict[str, 
     except ValueError as error:
         if options.clock is not None or not re.match("Missing (--)?clock", str(error)):
             raise
-    with catch_warnings(action="ignore"):  # its attributes have them, without this clock
+    with catch_warnings():
+        filterwarnings("ignore", ".*, (and|by) clock= ")  # of a rate that is not this one
         lines = _described(paths, Namespace(**{**vars(options), "clock": [1.0]}), camera)
     lines = {name: value for name, value in lines.items() if name not in _BY_CLOCK}
     notes = lines["attributes"].pop("warnings", [])

@@ -391,8 +391,7 @@ def status(result: xr.Dataset) -> Figure:
     codes, shown = legend(result["status"])  # the first flag of each pixel
     image = np.array([to_rgb(color) for _, color, _ in shown])[codes]
     height = 5.2 * codes.shape[0] / codes.shape[1]
-    figure, axes = canvas(1, 2, (9.6, max(height, 0.25 * len(shown)) + 0.6))
-    map_axis, legend_axis = axes[0]
+    figure, ((map_axis, legend_axis),) = canvas(1, 2, (9.6, max(height, 0.25 * len(shown)) + 0.6))
     map_axis.get_gridspec().set_width_ratios([1.3, 1.0])
     map_axis.imshow(image, interpolation="nearest")
     map_axis.set(xticks=[], yticks=[])

@@ -303,7 +303,8 @@ def recording(
     # Flags of frames without a time, and behind a gap.
     flags = np.zeros(seconds.size, dtype=np.uint16) if flags is None else flags
     flags[stands] |= FileFlag.TIME_STANDS.value
-    period = np.median(np.diff(exposed[stamped]) / np.diff(stamped)) if stamped.size > 1 else 1.0
+    periods = np.diff(exposed[stamped]) / np.diff(stamped) if stamped.size > 1 else 1.0
+    period = np.percentile(periods, 50, method="lower")  # of two, the one without a gap
     late = np.diff(exposed[stamped]) > _GAP * period * np.diff(stamped)
     flags[stamped[1:][late]] |= FileFlag.FRAMES_LOST_BEFORE.value
     # The dataset, with a clock without holes.
@@ -347,7 +348,7 @@ def clocked(counts: Counts, clock: Any, name: str, *sentences: str, **attrs: str
     doubts = [] if sentences else _time_elsewhere(counts, name)  # or, of rows cut elsewhere, those
     if (late := np.flatnonzero(made["frame_flags"].values & FileFlag.FRAMES_LOST_BEFORE)).size:
         steps = np.diff(seconds)
-        missing = np.rint(steps[late - 1] / np.median(steps) - 1.0).sum()
+        missing = np.rint(steps[late - 1] / np.percentile(steps, 50, method="lower") - 1.0).sum()
         label = f"The times or numbers of '{name}' leave out {missing:.0f} frames"
         rule = "Must be all that were recorded: there are gaps in time in their place"
         doubts.append(f"{label}, the first before frame {late[0]}. {rule}.")

@@ -153,9 +153,8 @@ def _are_longer(counts: Counts) -> bool:
     values = counts[0].ravel().astype(np.int32)
     if values.size < _FIRST * 4:
         return False
-    sets = [values, *(values[n::4] for n in range(4))]
-    steps = [float(np.median(np.abs(np.diff(numbers)))) for numbers in sets]
-    return max(steps) > _LONGER * (min(steps[1:]) + 1)
+    steps = [np.median(np.abs(np.diff(it))) for it in (values, *(values[n::4] for n in range(4)))]
+    return bool(max(steps) > _LONGER * (min(steps[1:]) + 1))
 
 
 def sequence(path: str | Path, *, clock: Clock | None = None, memory: float = MEMORY) -> xr.Dataset:
