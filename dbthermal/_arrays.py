@@ -87,7 +87,7 @@ def empty(shape: tuple[int, ...], dtype: npt.DTypeLike) -> Values:
                 os.posix_fallocate(file.fileno(), 0, size)
             pages = mmap.mmap(file.fileno(), size)
     except OSError as error:
-        label = f"No film of {size / 1e6:.3g} MB in '{folder}', beside the output"
+        label = f"No film of {size / 1e6:.3g} MB in '{folder}'"
         raise OSError(f"{label}: {error.strerror}. Must have room, and be writable.") from error
     _MAPS.add(pages)
     return np.frombuffer(pages, dtype).reshape(shape)

@@ -230,6 +230,15 @@ def test_info_of_stores_and_files(results: Path) -> None:
         file["time"].make_scale("time")
         file["counts"].dims[0].attach_scale(file["time"])
     assert done(results, "info", "timed.h5")["timed.h5"]["frame_rate_Hz"] == pytest.approx(10)
+    with h5py.File(results / "whole.h5", "w") as file:  # times in whole milliseconds
+        file["counts"], file["time_ms"] = film, np.arange(FRAMES) * 1000 // 30
+    whole = done(results, "info", "whole.h5")["whole.h5"]
+    assert whole["frame_rate_Hz"] == pytest.approx(30, rel=1e-3)
+    with h5py.File(results / "stated.h5", "w") as file:  # a rate that is stated is no clock
+        file["counts"], file.attrs["fps"] = film, 30.0
+    stated = done(results, "info", "stated.h5")["stated.h5"]
+    assert "--clock" in stated["clock"]
+    assert stated["attributes"]["warnings"] == ["'stated.h5' states 30 frames a second."]
     one = done(results, "info", "a.tif", "--unit", "count", "--clock", "10")["a.tif"]
     assert one["stage"] == "recording"
     assert one["attributes"]["byte_order"] == "little"
@@ -650,7 +659,7 @@ import folder --bands a b --clock 10 -o x.zarr -> Invalid folder .* Must be file
 info folder -> Invalid folder 'folder', no whole zarr. Must be files: folder/.*.tif
 info nothing*.zarr -> No file or folder 'nothing.*.zarr'
 info 1714*.tif --clock 30 -> Warning: The dates of .* are 1 s apart, by --clock 0.0333 s. Must be
-info ../user?/gap[0-9]*.tif --clock 9 -> Warning: The numbers of 'gap8.tif to gap11.tif' leave
+info ../user?/gap[0-9]*.tif --clock 9 -> Warning: The times or numbers of 'gap8.tif to gap11.*leave
 plan gold --noise 0.03 -> Unknown material 'gold'
 export result.zarr -o out.xyz -> Must end in one of .'.csv', '.tif', '.nc', '.png'
 export result.zarr --pixel 1 1 -o curve.txt -> Must end in one of .'.csv'

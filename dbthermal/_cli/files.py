@@ -9,6 +9,7 @@ from itertools import groupby
 from pathlib import Path
 from tempfile import gettempdir
 from typing import Any, Final
+from warnings import catch_warnings, filterwarnings
 
 import numpy as np
 import xarray as xr
@@ -258,8 +259,12 @@ def _described(paths: list[Path], options: Namespace, camera: int) -> dict[str, 
     except ValueError as error:
         if options.clock is not None or not re.match("Missing (--)?clock", str(error)):
             raise
-    lines = _described(paths, Namespace(**{**vars(options), "clock": [1.0]}), camera)
+    with catch_warnings():
+        filterwarnings("ignore", ".*, (and|by) clock= ")  # of a rate that is not this one
+        lines = _described(paths, Namespace(**{**vars(options), "clock": [1.0]}), camera)
     lines = {name: value for name, value in lines.items() if name not in _BY_CLOCK}
+    notes = lines["attributes"].pop("warnings", [])
+    lines["attributes"]["warnings"] = [re.sub(", (and|by) clock= .*", ".", it) for it in notes]
     return lines | {"clock": "not in the file: state the frame rate by --clock"}
 
 
@@ -336,7 +341,8 @@ def outline(dataset: xr.Dataset) -> dict[str, Any]:
     if dataset.sizes.get("time", 0) > 1 and "time" in dataset.coords:
         time = dataset["time"].values
         lines["seconds"] = round(float(time[-1] - time[0]), 6)
-        lines["frame_rate_Hz"] = round(float(1 / np.median(np.diff(time))), 6)
+        steps = np.diff(time)  # of whole milliseconds their mean is the period, without gaps
+        lines["frame_rate_Hz"] = round(1 / steps[steps < 1.5 * np.median(steps)].mean(), 6)
     return lines
 
 

@@ -331,11 +331,9 @@ def _table(
 ) -> Iterator[str]:
     """Yield the lines of a plan: what it assumes, and a row for each material."""
     filters = [*next(iter(numbers.values()))["object_temperature_std_K"]]
-    yield (
-        f"Assumed: {design.seconds:g} s at {design.rate:g} Hz; the object rises by {design.span:g} "
-        f"K, the reflections by {design.amplitude:g} K for {design.duration:g} s in every "
-        f"{design.period:g} s."
-    )
+    rises = f"the object rises by {design.span:g} K, the reflections by {design.amplitude:g} K for "
+    rises += f"{design.duration:g} s in every {design.period:g} s"
+    yield f"Assumed: {design.seconds:g} s at {design.rate:g} Hz; {rises}."
     behind = ", ".join(f"{float(noise.sel(band=name)):.2g} K ({name} um)" for name in filters)
     yield f"Noise of a frame behind a filter: {behind}."
     yield "Deviation of the object's temperature [K], second band behind the filter [um]:"

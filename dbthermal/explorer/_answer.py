@@ -98,12 +98,10 @@ def by_material(result: xr.Dataset, measured: Mask, table: xr.Dataset) -> list[d
     bands = [str(band) for band in result["band"].values]
     budget = result.get(schema.BUDGETS["emissivity"])
     drift = 0.0 * result["emissivity_std"] if budget is None else budget.sel(cause="drift")
-    values, stds, drift_stds = (
-        variable.transpose("band", "y", "x").values[:, measured].T.astype(np.float64)
-        for variable in (result["emissivity"], result["emissivity_std"], drift)
-    )
-    finite = np.isfinite(values + stds).all(axis=1)
-    values, stds, drift_stds = values[finite], stds[finite], drift_stds[finite]
+    variables = (result["emissivity"], result["emissivity_std"], drift)
+    tables = [it.transpose("band", "y", "x").values[:, measured].T for it in variables]
+    finite = np.isfinite(tables[0] + tables[1]).all(axis=1)
+    values, stds, drift_stds = (table[finite].astype(np.float64) for table in tables)
     steady_stds = np.sqrt(np.maximum(stds**2 - drift_stds**2, 0.0))
     vague = stds.max(axis=1, initial=0.0) >= _VAGUE
     # Pixels of a label by their median: it tells materials apart that single pixels do not.
@@ -126,14 +124,12 @@ def by_material(result: xr.Dataset, measured: Mask, table: xr.Dataset) -> list[d
     # Medians of each group, and the materials within a deviation; none for the vague group.
     listed = []
     for pixels in (pixels for pixels in groups if pixels.sum() >= max(1, _COMMON * len(values))):
-        middle, std, steady = (
-            np.median(array[pixels], axis=0) for array in (values, stds, steady_stds)
-        )
+        medians = [np.median(array[pixels], axis=0) for array in (values, stds, steady_stds)]
         entry: dict[str, Any] = {"pixels": int(pixels.sum()), "nearest": []}
-        for key, numbers in zip(_EMISSIVITIES, (middle, std, steady), strict=True):
+        for key, numbers in zip(_EMISSIVITIES, medians, strict=True):
             entry[key] = dict(zip(bands, numbers.tolist(), strict=True))
         if pixels is not groups[0]:
-            near = nearest(bands, middle, std, table)
+            near = nearest(bands, medians[0], medians[1], table)
             entry["nearest"] = [place for place in near if place["distance"] < 1]
         listed.append(entry)
     return sorted(listed, key=lambda entry: -entry["pixels"])

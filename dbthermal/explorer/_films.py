@@ -161,9 +161,8 @@ def marks(capture: xr.Dataset, time: Array) -> dict[str, float]:
     if "frame_flags" in capture:
         flags = capture["frame_flags"]
         for name in str(flags.attrs.get("flag_meanings", "")).split():
-            marked[name.replace("_", " ")] = np.asarray(
-                schema.has_flag(flags, name).any([dim for dim in flags.dims if dim != "time"])
-            )
+            dims = [dim for dim in flags.dims if dim != "time"]
+            marked[name.replace("_", " ")] = schema.has_flag(flags, name).any(dims).values
     events = {}
     for name, where in marked.items():
         begins = np.flatnonzero(where & ~np.roll(np.append(where, False), 1)[:-1])

@@ -326,8 +326,6 @@ class View:
         if name != "status" and regions:
             listed = pformat(dict(regions), width=88, sort_dicts=False)
             curve = f"view.curve({name!r}, region, pixels={pixels!r})"
-            lines += [
-                f"regions = {listed}",
-                f"curves = {{key: {curve} for key, region in regions.items()}}",
-            ]
+            lines.append(f"regions = {listed}")
+            lines.append(f"curves = {{key: {curve} for key, region in regions.items()}}")
         return "\n".join(lines) + "\n"

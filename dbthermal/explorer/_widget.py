@@ -148,10 +148,8 @@ class Explorer(anywidget.AnyWidget):
         # The isotherm is drawn on temperatures alone.
         lined = names if level is not None and less is None else []
         lined = [name for name in lined if self.view.panes[name].absolute]
-        sides = [
-            np.where(schema.measured(frames[name]), 1 + (frames[name] > level), 0).astype(np.uint8)
-            for name in lined
-        ]
+        shown = [frames[name] for name in lined]
+        sides = [np.where(schema.measured(it), 1 + (it > level), 0).astype("u1") for it in shown]
         self._state["index"] = request["index"]
         measured = self.view.counted("measured")
         spots = {name: extremes(frames[name], measured) for name in names if name in FILMS}
@@ -187,11 +185,8 @@ class Explorer(anywidget.AnyWidget):
 
     def _answer_curves(self, request: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
         """Answer the curves of all regions in a pane."""
-        points = {name: (kind, points) for name, kind, points in request["regions"]}
-        self.regions = {
-            name: Region(kind, tuple(map(tuple, outline)))
-            for name, (kind, outline) in points.items()
-        }
+        drawn = request["regions"]
+        self.regions = {name: Region(kind, tuple(map(tuple, line))) for name, kind, line in drawn}
         self._state |= {"pixels": request["pixels"], "pane": request["pane"]}
         buffers, counts = [], []
         for region in self.regions.values():

@@ -324,12 +324,9 @@ def plan(expected: xr.Dataset, durations: xr.Dataset, materials: Sequence[str]) 
     filtered = best[np.isin(best.values, std["filter"].values)]
     for index, name in enumerate(filtered["material"].values):
         chosen = str(filtered.sel(material=name).item())
-        bar_axis.loglog(
-            durations["seconds"],
-            durations["object_temperature_std"].sel(material=name, filter=chosen),
-            label=f"{name}, {chosen} {_MICRO}",
-            **drawing.marked_line(index),
-        )
+        stds = durations["object_temperature_std"].sel(material=name, filter=chosen)
+        line = {**drawing.marked_line(index), "label": f"{name}, {chosen} {_MICRO}"}
+        bar_axis.loglog(durations["seconds"], stds, **line)
     drawing.plain_ticks(bar_axis, durations["seconds"])
     drawing.plain_decades(bar_axis)
     bar_axis.set(xlabel="length of the film [s]", ylabel="expected std [K]")
@@ -394,8 +391,7 @@ def status(result: xr.Dataset) -> Figure:
     codes, shown = legend(result["status"])  # the first flag of each pixel
     image = np.array([to_rgb(color) for _, color, _ in shown])[codes]
     height = 5.2 * codes.shape[0] / codes.shape[1]
-    figure, axes = canvas(1, 2, (9.6, max(height, 0.25 * len(shown)) + 0.6))
-    map_axis, legend_axis = axes[0]
+    figure, ((map_axis, legend_axis),) = canvas(1, 2, (9.6, max(height, 0.25 * len(shown)) + 0.6))
     map_axis.get_gridspec().set_width_ratios([1.3, 1.0])
     map_axis.imshow(image, interpolation="nearest")
     map_axis.set(xticks=[], yticks=[])
@@ -405,9 +401,7 @@ def status(result: xr.Dataset) -> Figure:
         Patch(facecolor=color, edgecolor="0.5", label=f"{drawing.percent(share)}  {words}")
         for words, color, share in shown
     ]
-    legend_axis.legend(
-        handles=patches, loc="upper left", borderaxespad=0.0, frameon=False, fontsize=9
-    )
+    legend_axis.legend(handles=patches, loc=2, borderaxespad=0.0, frameon=False, fontsize=9)
     shares = {words: share for words, _, share in shown}
     completed = sum(share for words, share in shares.items() if "completed" in words)
     good = f"{drawing.percent(shares.get(_GOOD[0], 0.0))} of the pixels have no flag"
@@ -427,8 +421,7 @@ def legend(flags: xr.DataArray) -> tuple[npt.NDArray[np.uint8], list[tuple[str, 
 def first_reason(flags: xr.DataArray) -> npt.NDArray[np.str_]:
     """Name of the most decisive flag of each pixel of a `status`; empty without a flag."""
     bits = flags.values.astype(np.uint32)  # of older results they are of 16 bit
-    unknown = int(np.bitwise_or.reduce(bits, axis=None)) & ~sum(schema.Status)
-    if unknown:
+    if unknown := int(np.bitwise_or.reduce(bits, axis=None)) & ~sum(schema.Status):
         raise ValueError(f"Unknown bits {unknown} of a status. Must be of {schema.Status.bits()}.")
     masks = [(bits & schema.Status.bits()[name]) != 0 for name in REASONS]
     return np.select(masks, [np.array(name) for name in REASONS], default=np.array(""))

@@ -110,9 +110,11 @@ def array(
             lines = dict([(c.name, c) for c in coords if _are_times(c.name, c)][:1])
         attributes = _checked(values, label, unit)
         _recording.check_memory(getattr(values, "shape", ()), memory, label, stored)
-        rates = _rates(values, lines, path)
+        rates, sentences = _rates(values, lines, path), list[str]()
         for line in lines.items():
-            seconds = _seconds(line, values.shape[0], clock, label, path)
+            if (seconds := _seconds(line, values.shape[0], clock, label, path)) is None:
+                rule = "Must be numbers or ISO 8601; clock= is not compared with them"
+                sentences.append(f"Times '{line[0]}' of '{label}' are another text. {rule}.")
             clock = seconds if clock is None else clock
         stamps = _recording.stamps(clock, values.shape[0], label)
         read = _read(values, path) if is_file else _recording.film(values)
@@ -126,7 +128,7 @@ def array(
     if low < high and (counts.min() < low or counts.max() > high):  # else it is no range
         rule = f"Must lie within valid_range, {low:g} to {high:g}: beyond, none was measured"
         raise ValueError(f"Invalid counts of '{label}', {counts.min()} to {counts.max()}. {rule}.")
-    sentences = [it for rate in rates for it in _recording.another_rate(rate, stamps, label)]
+    sentences += [it for rate in rates for it in _recording.another_rate(rate, stamps, label)]
     origin = schema.origin(attributes)
     return _recording.clocked(counts, stamps, label, *sentences, format="array", **origin)
 
@@ -162,14 +164,14 @@ def _checked(values: Any, label: str, unit: str) -> dict[str, Any]:
 
 
 def _seconds(line: Any, frames: int, clock: Clock | None, label: str, path: Path) -> Clock | None:
-    """Seconds by named times, which the clock must not contradict; the clock for a text."""
+    """Seconds by named times, which the clock must not contradict; None for a text."""
     name, times = line
     if times.size != frames:
         rule = f"Must be {frames}, one for each frame"
         raise ValueError(f"Invalid number {times.size} of times of '{label}'. {rule}.")
     _check_whole(times, path)
     if (moments := _moments(times)) is None:
-        return clock
+        return None
     unit = "s" if times.dtype.kind in "OSU" else _attribute(times, "units")
     unit = unit or (re.search("_(s|ms|us|ns)$", str(name).lower()) or ("", ""))[1]  # by its name
     return _recording.check_times(moments, str(unit), clock, label)
@@ -243,11 +245,14 @@ def _times_of(arrays: dict[str, Any], name: str, path: Path) -> dict[str, Any]:
     lines = {key.rpartition("/")[::2]: array for key, array in arrays.items() if array.ndim < 3}
     if dims and (group, dims[0]) in lines:
         return {dims[0]: lines[group, dims[0]]}
-    films = sum(array.ndim == 3 for array in arrays.values())
+    # Times in its group, and below the outermost group that has no other film.
+    films = [key for key, array in arrays.items() if array.ndim == 3 and key != name]
+    groups = ["", *(name[: n + 1] for n, letter in enumerate(name) if letter == "/")]
+    around = next((it for it in groups if not any(key.startswith(it) for key in films)), name)
     named = {
         key: array
         for (place, key), array in lines.items()
-        if _BESIDE.fullmatch(key) and (place == group or films == 1)
+        if _BESIDE.fullmatch(key) and (place == group or f"{place}/".startswith(around))
     }
     for key, number in ((key, times.size) for key, times in named.items()):
         if number != frames and number in image:

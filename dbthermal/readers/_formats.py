@@ -33,7 +33,7 @@ SEQUENCES: Final = (".sfmov", ".hcc")
 _EXPORT: Final = "export its counts as 16-bit TIFF with the maker's program and use readers.tiff"
 _DRAWN: Final = (
     "most have 8 bits that are drawn, not measured: record 16-bit counts; one of 16-bit counts is "
-    "read by readers.raw after: ffmpeg -i FILE -pix_fmt gray16le -f rawvideo counts.raw"
+    "read by readers.raw (--shape) after: ffmpeg -i FILE -pix_fmt gray16le -f rawvideo counts.raw"
 )
 _FOREIGN: Final = {  # what to do with a format that no reader opens, by suffix or first bytes
     **dict.fromkeys((".ravi", ".irb", ".ats", ".is2", ".is3", ".bmt", ".ptw"), _EXPORT),

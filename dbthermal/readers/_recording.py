@@ -86,11 +86,14 @@ def numbered(paths: Sequence[Path]) -> tuple[Array | None, float]:
     steps = np.diff(moments if is_dated else table[:, counting[0]])
     usual = float(np.percentile(steps, 50, method="lower") or 1.0)
     places = np.rint(apart := steps / usual)
-    near = np.abs(apart - places).max() < _JITTER and places.min() > 0
     exact = not is_dated and np.array_equal(apart, places)
-    near &= places.sum() < 2 * len(paths)
-    gaps = places.max() > _GAP and (exact or near)
-    is_clock = is_dated and near and steps.sum() > 1.0  # no counter behind a date
+    # Dates jump where a clock was set; a number behind a date that rises is a counter, no fraction.
+    counter = table[0, -1] < 1e9 and np.diff(table[:, -1]).min() > 0 and np.any(moments % 1)
+    may_jump = is_dated and not counter
+    near = (np.abs(apart - places) < _JITTER) & (places > 0) | (may_jump & (places > len(paths)))
+    regular = bool(near.all()) and (may_jump or places.sum() < 2 * len(paths))
+    gaps = places.max() > _GAP and (exact or regular)
+    is_clock = is_dated and regular and steps.sum() > 1.0  # no counter behind a date
     return np.cumsum(np.append(0.0, places)) if gaps else None, is_clock * usual
 
 
@@ -229,7 +232,7 @@ def check_times(values: npt.NDArray[Any], unit: str, clock: Clock | None, name: 
     if not np.all(valid := rises if clock is None else rises & agrees):
         first = int(np.argmin(valid))
         mismatch = f"frame {first} at {seconds[first]:g} s, by clock= at {stated[first]:g}"
-        rule = "Must agree to half a frame, and rise; without clock= those of the file are taken"
+        rule = "Must agree to half a frame, and rise: leave clock= out, or numbers of frames"
         if not rises[first]:
             mismatch = f"frame {first} at {seconds[first]:g} s, after {seconds[first - 1]:g} s"
             rule = "Must rise: correct them, or save the counts without them and state clock= [Hz]"
@@ -300,7 +303,8 @@ def recording(
     # Flags of frames without a time, and behind a gap.
     flags = np.zeros(seconds.size, dtype=np.uint16) if flags is None else flags
     flags[stands] |= FileFlag.TIME_STANDS.value
-    period = np.median(np.diff(exposed[stamped]) / np.diff(stamped)) if stamped.size > 1 else 1.0
+    periods = np.diff(exposed[stamped]) / np.diff(stamped) if stamped.size > 1 else 1.0
+    period = np.percentile(periods, 50, method="lower")  # of two, the one without a gap
     late = np.diff(exposed[stamped]) > _GAP * period * np.diff(stamped)
     flags[stamped[1:][late]] |= FileFlag.FRAMES_LOST_BEFORE.value
     # The dataset, with a clock without holes.
@@ -332,7 +336,7 @@ def _check_unsigned(counts: Counts, name: str) -> None:
         wraps = 2**16 - np.abs(np.concatenate(steps))
         wraps = wraps[wraps < 2**15]  # signed; of dead beside saturated pixels few, or large
         if wraps.size > np.sqrt(image.size) and np.median(wraps) < _NEAR:
-            rule = "Must be whole numbers from 0: counts, and no temperatures"
+            rule = "Must be whole numbers from 0: counts, and no temperatures, nor a drawn text"
             raise ValueError(f"Invalid counts of '{name}': as of signed numbers. {rule}.")
 
 
@@ -341,15 +345,27 @@ def clocked(counts: Counts, clock: Any, name: str, *sentences: str, **attrs: str
     seconds = stamps(clock, len(counts), name)
     _check_unsigned(counts, name)
     made = recording(counts, seconds, name, {"source": name, **attrs})
-    return warned(made, *sentences, *_time_elsewhere(counts, name))
+    doubts = [] if sentences else _time_elsewhere(counts, name)  # or, of rows cut elsewhere, those
+    if (late := np.flatnonzero(made["frame_flags"].values & FileFlag.FRAMES_LOST_BEFORE)).size:
+        steps = np.diff(seconds)
+        missing = np.rint(steps[late - 1] / np.percentile(steps, 50, method="lower") - 1.0).sum()
+        label = f"The times or numbers of '{name}' leave out {missing:.0f} frames"
+        rule = "Must be all that were recorded: there are gaps in time in their place"
+        doubts.append(f"{label}, the first before frame {late[0]}. {rule}.")
+    return warned(made, *sentences, *doubts)
 
 
 def _time_elsewhere(counts: Counts, name: str) -> list[str]:
-    """Sentence on counts (time, y, x) whose time may be along another axis."""
+    """Sentence on counts (time, y, x) whose time may be along another axis, or of bands in turn."""
     sides = [slice(max(0, (n - _ALONG) // 2), (n + _ALONG) // 2) for n in counts.shape]
     middle = counts[tuple(sides)]
     if min(middle.shape) < 8:
         return []
+    still = middle.astype(np.int32)
+    steps = [np.median(np.abs(still[n:] - still[:-n]).mean(axis=(1, 2))) for n in range(1, 5)]
+    if SMOOTHER * min(steps) < steps[0]:
+        label = f"Frames of '{name}' are like those {np.argmin(steps) + 1} later, not like the next"
+        return [f"{label}. Must be of one band: save those of a filter wheel as a file for each."]
     # Roughness of an axis: mean second difference without its largest quarter, plus rounding.
     rough = list[float]()
     for axis in range(3):

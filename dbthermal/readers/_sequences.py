@@ -103,9 +103,7 @@ def raw(
         likely.append(shape[1] // 2)
     if likely:
         films = [np.reshape(images, (len(images), -1, width)) for width in likely]
-        film = min(
-            films, key=lambda film: sum(np.abs(np.diff(film, axis=n)).mean() for n in (1, 2))
-        )
+        film = min(films, key=lambda it: sum(np.abs(np.diff(it, axis=n)).mean() for n in (1, 2)))
         label = f"Invalid shape {shape} of '{name}': rougher than {film.shape[1:]}"
         raise ValueError(f"{label}. Must be rows, then columns.")
     decided = {"byte_order": byte_order, "byte_order_by": "caller"}
@@ -155,9 +153,8 @@ def _are_longer(counts: Counts) -> bool:
     values = counts[0].ravel().astype(np.int32)
     if values.size < _FIRST * 4:
         return False
-    fourths = [float(np.median(np.abs(np.diff(values[n::4])))) for n in range(4)]
-    near = float(np.median(np.abs(np.diff(values))))
-    return max(near, *fourths) > _LONGER * (min(fourths) + 1)
+    steps = [np.median(np.abs(np.diff(it))) for it in (values, *(values[n::4] for n in range(4)))]
+    return bool(max(steps) > _LONGER * (min(steps[1:]) + 1))
 
 
 def sequence(path: str | Path, *, clock: Clock | None = None, memory: float = MEMORY) -> xr.Dataset:

@@ -127,11 +127,7 @@ def tiff(
         sentences.append(f"{label}. Must be the rate of recording.")
     if places is not None and {*lengths[:-1]} <= {size}:  # the last stack may be shorter
         spans = zip(size * places, (size, *lengths), strict=True)
-        numbers = np.concatenate([first + np.arange(length) for first, length in spans])
-        missing = int(numbers[-1]) + 1 - len(numbers)
-        rule = "Must be all that were recorded: there are gaps in time in their place"
-        sentences.append(f"The numbers of '{name}' leave out {missing} frames. {rule}.")
-        seconds = numbers * seconds[1]
+        seconds = seconds[1] * np.concatenate([first + np.arange(n) for first, n in spans])
     # Pixels, from the places that the pages state.
     counts, at = empty(shape, np.uint16), 0
     for page in pages:

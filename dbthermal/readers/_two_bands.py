@@ -79,7 +79,7 @@ def two_bands(
     shape, *shapes = [(recording.sizes["y"], recording.sizes["x"]) for recording in cameras]
     if unlike := {*shapes} - {shape}:
         label = f"Different sizes {shape} and {unlike.pop()} pixels of the bands {names}"
-        raise ValueError(f"{label}. Must be equal: resample recordings, or crop the others.")
+        raise ValueError(f"{label}. Must be equal: turn, resample or crop a recording.")
     # Offsets of the clocks, by which they must overlap.
     shifts = [0.0, *_offsets(cameras, offset)]
     starts, stops = ([recording["time"].values[n] for recording in cameras] for n in (0, -1))
@@ -120,8 +120,8 @@ def two_bands(
         "files": {name: dict(it.attrs) for name, it in zip(names, cameras, strict=True)},
     }
     capture = schema.check(xr.Dataset(variables, {"band": names, "time": time}, attrs), "capture")
-    borders = map(_border, overlapping, names)
-    return warned(capture, *_temperatures(overlapping), *filter(None, borders))
+    samples = [film[:: 1 + len(film) // _FRAMES] for film in overlapping]
+    return warned(capture, *_temperatures(samples), *_unchanging(samples, names))
 
 
 def _offsets(cameras: Sequence[xr.Dataset], offset: Any) -> list[float]:
@@ -149,21 +149,28 @@ def _names(bands: Any, number: int) -> list[str]:
     return names
 
 
-def _border(counts: npt.NDArray[np.uint16], name: str) -> str:
-    """Sentence on rows and columns at a band's border that have the same value in all frames."""
-    sample = counts[:: 1 + len(counts) // _FRAMES]
-    padded = (sample == sample[0, 0, 0]) | (sample == sample[0, -1, -1])
-    rows, columns = (int(padded.all(axis=axes).sum()) for axes in ((0, 2), (0, 1)))
-    if rows == padded.shape[1] or not rows + columns:
-        return ""
-    label = f"{rows} rows and {columns} columns of band '{name}' have one value in all frames"
-    return f"{label}: a border, which is no measurement. Its pixels are flagged; better cropped."
+def _unchanging(samples: list[npt.NDArray[np.uint16]], names: list[str]) -> list[str]:
+    """Sentences on pixels that never change: rows and columns of a band, or places of all bands."""
+    stills, sentences = [(sample == sample[0]).all(axis=0) for sample in samples], list[str]()
+    for still, name in zip(stills, names, strict=True):
+        rows, columns = (int(still.all(axis=axis).sum()) for axis in (1, 0))
+        if rows < len(still) and rows + columns:
+            label = (
+                f"{rows} rows and {columns} columns of band '{name}' have one value in all frames"
+            )
+            sentences.append(f"{label}: a border. Its pixels are flagged; better cropped.")
+    drawn = np.all(stills, axis=0)
+    drawn = drawn[~drawn.all(axis=1)][:, ~drawn.all(axis=0)]
+    if np.sqrt(drawn.size) < drawn.sum() < drawn.size / 2:  # more than by chance
+        label = f"{drawn.sum()} pixels never change in any band: saturated, or a text that is drawn"
+        rule = "Must be none: register cameras that stand apart by a film without it"
+        sentences.append(f"{label} into the images. {rule}.")
+    return sentences
 
 
-def _temperatures(films: list[npt.NDArray[np.uint16]]) -> list[str]:
+def _temperatures(samples: list[npt.NDArray[np.uint16]]) -> list[str]:
     """Sentence on counts that read as the same temperatures, in hundredths or tenths."""
-    samples = [counts[:: 1 + len(counts) // _FRAMES].ravel() for counts in films]
-    low, middle, high = np.percentile(samples, [1, 50, 99], axis=1)
+    low, middle, high = np.percentile(samples, [1, 50, 99], axis=(1, 2, 3))
     for scale, zero, unit in ((100, 0.0, "degC"), (100, zero_Celsius, "K"), (10, 0.0, "degC")):
         least, most = (scale * (zero + limit) for limit in _SCENE)
         if np.all((low >= least) & (high <= most)) and np.ptp(middle) < scale * _ALIKE:

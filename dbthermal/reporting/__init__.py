@@ -184,12 +184,10 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
 def _chosen(view: View, regions: Mapping[str, Region]) -> dict[str, Region]:
     """Regions that are stated, or the whole image."""
     schema.require(regions, Mapping, "regions")
+    rule = 'Must be an explorer.Region("rectangle", ((10, 5), (40, 30))) of (row, column)'
     for name, region in regions.items():
         if not isinstance(region, Region):
-            raise TypeError(
-                f"Invalid region {name!r}, {region!r}. Must be an explorer.Region, such as "
-                'Region("rectangle", ((10, 5), (40, 30))) of corners (row, column).'
-            )
+            raise TypeError(f"Invalid region {name!r}, {region!r}. {rule}.")
     whole = Region("rectangle", ((0, 0), view.shape))
     return dict(regions) or {"measured pixels of the whole image": whole}
 
@@ -275,16 +273,13 @@ def _summary(curves: Mapping[str, xr.Dataset], materials: xr.Dataset) -> dict[st
     summary: dict[str, Any] = {"pixels": int(curves["object_temperature"]["pixels"].max())}
     for name in (name for name in FILMS if name in curves):
         curve = curves[name]
-        keys = ("mean", "std", "calibration_std")
-        summary[name] = {key: _plain(curve[key].mean()) for key in keys}
-        summary[name]["minimum"] = _plain(curve["mean"].min())
-        summary[name]["maximum"] = _plain(curve["mean"].max())
+        means = {key: curve[key].mean() for key in ("mean", "std", "calibration_std")}
+        ends = {"minimum": curve["mean"].min(), "maximum": curve["mean"].max()}
+        summary[name] = {key: _plain(value) for key, value in {**means, **ends}.items()}
     bands = [name.removeprefix("emissivity ") for name in curves if name.startswith("emissivity ")]
     if bands:
-        values, stds = (
-            np.array([float(curves[f"emissivity {band}"][key]) for band in bands])
-            for key in ("mean", "std")
-        )
+        tables = [curves[f"emissivity {band}"] for band in bands]
+        values, stds = (np.array([float(it[key]) for it in tables]) for key in ("mean", "std"))
         summary["emissivity"] = dict(zip(bands, map(_plain, values), strict=True))
         summary["emissivity_std"] = dict(zip(bands, map(_plain, stds), strict=True))
         summary["nearest"] = nearest(bands, values, stds, materials)

@@ -51,13 +51,13 @@ def test_files_of_numpy(tmp_path: Path, order: str, layout: Any) -> None:
 
 def test_times_of_npz_and_arrays_of_other_libraries(tmp_path: Path) -> None:
     """Times in a .npz are its clock; lists and tensors are arrays; shapes are named."""
-    np.savez(tmp_path / "a.npz", frames=scene(), time=[0.0, 0.1, 0.3], notes=np.array([{}]))
-    assert_allclose(read(tmp_path / "a.npz", clock=None).time, [0.0, 0.1, 0.3])
+    np.savez(tmp_path / "a.npz", frames=scene(), time=[0.0, 0.1, 0.24], notes=np.array([{}]))
+    assert_allclose(read(tmp_path / "a.npz", clock=None).time, [0.0, 0.1, 0.24])
     with pytest.raises(ValueError, match=r"Invalid times of 'a\.npz'.* Must agree to half a frame"):
         read(tmp_path / "a.npz", clock=30.0)
-    for times in ({"time_ns": [7e9, 7.1e9, 7.3e9]}, {"t_ms": [0, 100, 300]}):  # unit by the name
+    for times in ({"time_ns": [7e9, 7.1e9, 7.24e9]}, {"t_ms": [0, 100, 240]}):  # unit by the name
         np.savez(tmp_path / "a.npz", frames=scene(), **times)
-        assert_allclose(read(tmp_path / "a.npz", clock=None).time, [0.0, 0.1, 0.3])
+        assert_allclose(read(tmp_path / "a.npz", clock=None).time, [0.0, 0.1, 0.24])
     assert_array_equal(read([*scene()]).counts, scene())
     np.savez(tmp_path / "a.npz", *[scene()] * 20)
     with pytest.raises(ValueError, match=r"Must be one of \['arr_0', .*, 'arr_5', '\.\.\.'\]\."):
@@ -219,7 +219,7 @@ def test_times_of_an_array_agree_with_the_clock(
 @pytest.mark.parametrize(
     ("times", "unit", "expected"),
     [
-        ([0.0, 0.1, 0.7], None, [0.0, 0.1, 0.7]),
+        ([0.0, 0.1, 0.24], None, [0.0, 0.1, 0.24]),
         ([5, 105, 205], "ms", [0.0, 0.1, 0.2]),
         ([0, 100, 200], None, "Missing unit of the times of 'a.h5', which rise by 100 a frame"),
         ([0.0, 0.2, 0.1], "s", "frame 2 at 0.1 s, after 0.2 s. Must rise"),
@@ -242,12 +242,35 @@ def test_times_of_a_file_are_its_clock(
         assert_allclose(made["exposure_time"], expected, atol=1e-9)  # [s]
 
 
+def test_a_gap_in_the_times_is_named() -> None:
+    """As of an hour that the local time leaves out in spring."""
+    dates = np.datetime64("2026-03-29T01:59:59.8", "ns") + np.arange(6) * np.timedelta64(100, "ms")
+    dates[2:] += np.timedelta64(1, "h")
+    array = xr.DataArray(scene(6), {"time": dates}, ("time", "y", "x"))
+    with pytest.warns(
+        UserWarning, match="'array' leave out 36000 frames, the first before frame 2"
+    ):
+        assert_allclose(read(array, clock=None).time[[1, 2]], [0.1, 3600.2])
+
+
+def test_frames_of_bands_in_turn_are_named() -> None:
+    """Of a filter wheel; frames of one band are less like later ones."""
+    film = scene(24)
+    assert not read(film).attrs.get("warnings")
+    for bands in (2, 3):
+        levels = 500 * (np.arange(24) % bands)[:, None, None].astype(np.uint16)
+        film = scene(24) // 9 + levels  # object and noise change little
+        with pytest.warns(UserWarning, match=f"are like those {bands} later, not like the next"):
+            read(film)
+
+
 def test_dates_of_an_array_agree_with_the_clock() -> None:
-    """Dates are times, too, and those of text are not compared."""
+    """Dates are times, too; another text is not compared, with a warning."""
     array = xr.DataArray(scene(), dims=("time", "y", "x"))
     steps = np.arange(3) * np.timedelta64(100, "ms")
     read(array.assign_coords(time=np.datetime64("2020-01-01", "ns") + steps))
-    read(array.assign_coords(time=["a", "b", "c"]))
+    with pytest.warns(UserWarning, match="Times 'time' of 'array' are another text"):
+        read(array.assign_coords(time=["a", "b", "c"]))
     with pytest.raises(ValueError, match=r"frame 1 at 0\.3 s, by clock= at 0\.1"):
         read(array.assign_coords(time=np.datetime64("2020-01-01", "ns") + 3 * steps))
 
@@ -457,8 +480,11 @@ MOMENTS = [f"2024-05-06T07:08:09.{n}00000Z" for n in range(3)]
 def test_times_beside_frames(tmp_path: Path, name: str) -> None:
     """Times without a dim that names them must agree with the clock, as numbers and as text."""
     path = tmp_path / "a.h5"
-    for times in ([7.0, 7.1, 7.2], MOMENTS, np.array(MOMENTS, "S"), ["a", "b", "c"]):
+    for times in ([7.0, 7.1, 7.2], MOMENTS, np.array(MOMENTS, "S")):
         assert_array_equal(read(hdf5(path, **{name: times})).counts, scene())
+    dates = [f"06.05.2024 07:08:09.{tenth}" for tenth in range(3)]  # no ISO 8601
+    with pytest.warns(UserWarning, match=rf"Times '{name}' of 'a\.h5' are another text\. Must be"):
+        assert_array_equal(read(hdf5(path, **{name: dates})).counts, scene())
     for times in (
         [7.0, 7.2, 7.4],
         [moment.replace(":09.", f":1{moment[-7]}.") for moment in MOMENTS],
@@ -474,6 +500,11 @@ def test_times_beside_frames(tmp_path: Path, name: str) -> None:
         read(hdf5(path, **{f"other/{name}": np.arange(3.0)}))
     two = {f"other/{name}": np.arange(3.0), "other/frames": scene()}
     assert_array_equal(read(hdf5(path, **two), "frames").counts, scene())
+    # Of two films, each has those below the outermost group that has no other film.
+    hdf5(path, **{f"b/about/{name}": [0.0, 0.2, 0.4], "b/raw/data": scene(), "c/data": scene()})
+    assert_array_equal(read(path, "b/raw/data", clock=None).time, [0.0, 0.2, 0.4])
+    with pytest.raises(ValueError, match=r"Invalid times of .* Must agree to half a frame"):
+        read(path, "b/raw/data")
 
 
 def test_user_block_and_matlab(tmp_path: Path) -> None:

@@ -96,8 +96,8 @@ def test_numbers_that_are_left_out_are_gaps_in_time(tmp_path: Path) -> None:
 def test_a_stack_that_is_left_out_is_a_gap_in_time(tmp_path: Path) -> None:
     """So is a whole stack of a recording in parts; one of two bands is not called truncated."""
     paths = [tmp_path / f"rec_{number}.tif" for number in (1, 2, 4)]
-    for path, frames in zip(paths, (3, 3, 2), strict=True):
-        write(path, scene(frames) + np.uint16(path.stem[-1]))
+    for path, frames in zip(paths, np.split(scene(8), (3, 6)), strict=True):
+        write(path, frames)
     with pytest.warns(UserWarning, match=r"'rec_1\.tif to rec_4\.tif' leave out 3 frames"):
         made = read(paths)
     assert_allclose(made["exposure_time"] * 10.0, [0, 1, 2, 3, 4, 5, 9, 10], atol=1e-9)  # [frame]
@@ -127,6 +127,23 @@ def test_dates_in_names_are_gaps_in_time(tmp_path: Path, form: str) -> None:
     with pytest.warns(UserWarning, match="leave out 3 frames"):
         made = read(paths)
     assert_allclose(made["exposure_time"], [0.0, 0.1, 0.2, 0.6, 0.7], atol=1e-9)  # [s]
+
+
+@pytest.mark.parametrize("fraction", ["", "_{:03}", ".{:03}"])
+def test_dates_in_names_that_jump(tmp_path: Path, fraction: str) -> None:
+    """In autumn the local hour comes twice: sorted by names, frames are in another order."""
+    clock, names = (5.0, []) if fraction else (1.0, list[str]())
+    for number in range(20):
+        second, part = divmod(number, 5) if fraction else (number, 0)
+        hour = "0259" if number < 10 else "0200"
+        names.append(
+            f"a_20261025_{hour}{second + 50 * (number < 10):02}{fraction.format(200 * part)}"
+        )
+    for name, image in zip(names, scene(20), strict=True):
+        write(tmp_path / f"{name}.tif", image)
+    with pytest.warns(UserWarning, match=r"leave out \d{4,5} frames, the first before frame 10\."):
+        made = read([tmp_path / f"{name}.tif" for name in sorted(names)], clock=clock)
+    assert made["time"].values[-1] > 3500.0  # [s]
 
 
 def test_dates_in_names_contradict_the_clock(tmp_path: Path) -> None:

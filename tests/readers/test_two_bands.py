@@ -33,6 +33,23 @@ def pair(tmp_path: Path) -> tuple[xr.Dataset, xr.Dataset]:
     return first, recorded(tmp_path / "b.seq", scene(30) + 1, 1.5e9 + 0.25, 12.5, {0x58: 16000.0})
 
 
+def test_a_text_that_is_drawn_into_the_images_is_named() -> None:
+    """Pixels that never change, at the same places of all bands, pull a registration."""
+    films = np.stack([scene(20), scene(20)[::-1] + np.uint16(900)])
+    films[0, :, 5, 5] = films[1, :, 7, 7] = 65535  # a dead pixel of each
+
+    def joined() -> xr.Dataset:
+        cameras = [readers.array(film, unit="count", clock=10.0) for film in films]
+        return readers.two_bands(*cameras, bands=BANDS, offset=0.0)
+
+    assert not joined().attrs.get("warnings")
+    films[:, :, 3:9, 4:16] = 65535
+    with pytest.warns(
+        UserWarning, match="^72 pixels never change in any band: saturated, or a text"
+    ):
+        joined()
+
+
 def test_a_border_is_noticed() -> None:
     """Rows and columns that pad an image are counted in a warning, which stays with the capture."""
     pads = ((0, 0), (4, 4), (0, 3))
