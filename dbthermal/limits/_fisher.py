@@ -29,7 +29,7 @@ _NEGLIGIBLE: Final = 0.1  # energy outside the smooth subspace, over the noise's
 _HIGHEST_ORDER: Final = 30  # largest subspace that is tried
 _ROUNDING: Final = 1e-12  # of information, relative to a parameter as the only unknown
 _DEPENDENT: Final = 1e-8  # squared share of a gradient along directions without information
-_PIXELS: Final = 512  # at once, in less than 100 MB at 350 frames
+_NUMBERS: Final = 2**22  # of derivatives at once, in about 100 MB
 
 
 @dataclass(frozen=True)
@@ -66,15 +66,14 @@ class Sensitivity:
         """Variance (time, pixel) [K2] of a frame's background, 1 / v^T v; 0 at rest."""
         return np.asarray(~self.resting / np.sum(self.reflection**2, axis=0))
 
-    def projection(self) -> Array:
-        r"""Projection (band, band, time, pixel) that eliminates the free background of a frame.
-
-        .. math:: W = 1 - v v^T / v^T v \qquad (2)
-
-        with v the reflection, over the bands; the unit matrix in a frame at rest.
-        """
-        unit = np.eye(len(self.reflection))[..., np.newaxis, np.newaxis]
-        return np.asarray(unit - self.reflection[:, np.newaxis] * self.reflection * self.free)
+    def jacobian(self, functions: Array) -> Array:
+        """Derivatives (pixel, time, band, unknown) with emissivities, object and resting level."""
+        derivatives = [
+            np.einsum("btp,bm->ptbm", self.contrast, np.eye(len(self.contrast))),
+            np.einsum("btp,tk->ptbk", self.emission, functions),
+            np.einsum("btp,tp->ptb", self.reflection, self.resting)[..., np.newaxis],
+        ]
+        return np.concatenate(derivatives, axis=-1)
 
 
 @dataclass(frozen=True)
@@ -114,18 +113,18 @@ def smallest_order(truth: Truth, sensitivity: Sensitivity) -> Indices:
 
     A subspace leaves :math:`r = x - \Phi \Phi^T x`, whose energy must satisfy
 
-    .. math:: \sum_t r(t)^2 \, p(t)^T W(t) \, p(t) \le 0.1 \qquad (3)
+    .. math:: \sum_t r(t)^2 \, | W(t) \, p(t) |^2 \le 0.1, \quad W = 1 - v v^T / v^T v \qquad (2)
 
-    with p the emission. It shifts no quantity by more than the root, 0.32, of that quantity's own
-    bound (Cauchy and Schwarz).
+    with p the emission and v the reflection, over the bands; W is 1 in a frame at rest. It shifts
+    no quantity by more than the root, 0.32, of that quantity's own bound (Cauchy and Schwarz).
     """
     highest = min(_HIGHEST_ORDER, truth.time.size)
     functions = _smooth.polynomial_basis(truth.time, highest)
     order = np.full(truth.object_temperature.shape[1], highest + 1, dtype=np.intp)
-    for pixels in _blocks(np.arange(order.size)):
+    for pixels in _blocks(np.arange(order.size), truth.time.size):
         selected = sensitivity.select(pixels)
-        p, projection = selected.emission, selected.projection()
-        weight = np.einsum("itp,ijtp,jtp->tp", p, projection, p)
+        p, v = selected.emission, selected.reflection
+        weight = np.sum((p - v * selected.free * np.sum(v * p, axis=0)) ** 2, axis=0)
         residual = truth.object_temperature[:, pixels]
         for count, function in enumerate(functions.T, start=1):
             residual = residual - np.outer(function, function @ residual)
@@ -159,7 +158,8 @@ def deviations(
     result = {name: np.zeros((size, pixels)) for name, size in rows.items()}
     for count in np.unique(order):
         functions = _smooth.polynomial_basis(time, int(count))
-        for block in _blocks(np.flatnonzero(order == count)):
+        numbers = frames * bands * (bands + int(count) + 1)
+        for block in _blocks(np.flatnonzero(order == count), numbers):
             stds = _deviations(sensitivity.select(block), functions, reference, prior)
             for name, values in stds.items():
                 if "temperature" in name or not is_known:
@@ -167,25 +167,31 @@ def deviations(
     return result
 
 
-def _blocks(pixels: Indices) -> list[Indices]:
-    """Pixels in blocks, for the memory that each takes."""
-    return np.split(pixels, range(_PIXELS, pixels.size, _PIXELS))
+def _blocks(pixels: Indices, numbers: int) -> list[Indices]:
+    """Pixels in blocks, for the memory that each takes, of so many numbers."""
+    size = max(1, _NUMBERS // numbers)
+    return np.split(pixels, range(size, pixels.size, size))
 
 
 def _deviations(
     sensitivity: Sensitivity, functions: Array, reference: int, prior: float
 ) -> dict[str, Array]:
     """Deviations of pixels of one order, for functions (time, order) and 1 / prior variance."""
-    emissivity = sensitivity.emissivity
-    bands, (frames, order) = len(emissivity), functions.shape
-    variance = fisher_variance(sensitivity, functions, prior)
+    emissivity, jacobian = sensitivity.emissivity, sensitivity.jacobian(functions)
+    bands, unknowns = jacobian.shape[2:]
+    # A free background follows the other unknowns, dy = -v^T J / v^T v, and leaves W J, see (2), of
+    # its frame; at rest it is the level.
+    along = sensitivity.reflection * sensitivity.free
+    of_background = -np.einsum("btp,ptbk->ptk", along, jacobian)
+    projected = jacobian + np.einsum("btp,ptk->ptbk", sensitivity.reflection, of_background)
+    of_background[..., -1] += sensitivity.resting.T
+    priors = np.where(np.arange(unknowns) < bands, prior, 0.0)
+    variance = fisher_variance(jacobian, projected, priors)
     # Gradients (pixel or 1, quantity, unknown): x(t) = Phi(t) c, d kappa_m = -d e_m / (1 - e_r)
     # + (1 - e_m) d e_r / (1 - e_r)^2.
-    of_emissivity = np.eye(bands, bands + order + 1)[np.newaxis]
-    of_object = np.zeros((1, frames, bands + order + 1))
-    of_object[0, :, bands:-1] = functions
-    of_background = _background(sensitivity, functions)
-    of_ratio = np.zeros((emissivity.shape[1], bands, bands + order + 1))
+    of_emissivity = np.eye(bands, unknowns)[np.newaxis]
+    of_object = np.pad(functions, ((0, 0), (bands, 1)))[np.newaxis]
+    of_ratio = np.zeros((emissivity.shape[1], bands, unknowns))
     of_ratio[:, range(bands), range(bands)] = -1.0 / (1.0 - emissivity[reference])[:, np.newaxis]
     of_ratio[:, :, reference] += ((1.0 - emissivity) / (1.0 - emissivity[reference]) ** 2).T
     of_ratio[:, reference] = 0.0  # 1 by definition, not but for rounding
@@ -198,43 +204,14 @@ def _deviations(
     return {name: np.sqrt(values.T) for name, values in variances.items()}
 
 
-def _background(sensitivity: Sensitivity, functions: Array) -> Array:
-    """Gradient (pixel, time, unknown) of each frame's background."""
-    # A free frame: dy = -v^T (g de + p dx) / v^T v, own variance 1 / v^T v; at rest: the level.
-    along = sensitivity.reflection * sensitivity.free
-    of_object = np.sum(along * sensitivity.emission, axis=0)
-    derivatives = [
-        -np.moveaxis(along * sensitivity.contrast, 0, -1),
-        -of_object[..., np.newaxis] * functions[:, np.newaxis],
-        sensitivity.resting[..., np.newaxis],
-    ]
-    return np.swapaxes(np.concatenate(derivatives, axis=-1), 0, 1)
-
-
-def fisher_variance(
-    sensitivity: Sensitivity, functions: Array, prior: float
-) -> Callable[[Array], Array]:
-    """Variances by gradients with emissivities (band), object (order) [K] and resting level [K]."""
-    # Over the samples, g = dz/de, p = dz/dx, v = dz/dy and w = v in the frames at rest, else 0.
-    g, p = sensitivity.contrast, sensitivity.emission
-    w = sensitivity.reflection * sensitivity.resting
-    projection = sensitivity.projection()
-    projected = np.einsum("ijtp,jtp->itp", projection, p)
-    products = functions[:, :, np.newaxis] * functions[:, np.newaxis]
-    # F_ee = sum_t g^T W g + prior,  F_ec = sum_t g^T W p Phi^T,  F_cc = sum_t p^T W p Phi Phi^T
-    ee = np.einsum("itp,ijtp,jtp->pij", g, projection, g) + prior * np.eye(len(g))
-    ec = np.einsum("itp,tk->pik", g * projected, functions)
-    cc = np.einsum("tp,tkl->pkl", np.sum(p * projected, axis=0), products)
-    # F_el = sum_t g^T w,  F_cl = sum_t p^T w Phi,  F_ll = sum_t w^T w
-    el = np.einsum("itp,itp->pi", g, w)[..., np.newaxis]
-    cl = np.einsum("tp,tk->pk", np.sum(p * w, axis=0), functions)[..., np.newaxis]
-    ll = np.sum(w**2, axis=(0, 1))[:, np.newaxis, np.newaxis]
-    ce, le, lc = (np.swapaxes(block, 1, 2) for block in (ec, el, cl))
-    fisher = np.block([[ee, ec, el], [ce, cc, cl], [le, lc, ll]])
+def fisher_variance(jacobian: Array, projected: Array, priors: Array) -> Callable[[Array], Array]:
+    """Variances by gradients with the unknowns of J, see `_deviations`, of W J and 1 / priors."""
+    pixels, *_, unknowns = jacobian.shape
+    # F = sum_t J^T W J + prior
+    samples = projected.reshape(pixels, -1, unknowns)
+    fisher = np.swapaxes(samples, 1, 2) @ samples + np.diag(priors)
     # Information about each unknown, were it the only one: no background to eliminate.
-    diagonal = np.concatenate(
-        [np.sum(g**2, axis=1).T + prior, np.sum(p**2, axis=0).T @ functions**2, ll[..., 0]], axis=1
-    )
+    diagonal = np.sum(jacobian**2, axis=(1, 2)) + priors
     scale = np.sqrt(np.divide(1.0, diagonal, out=np.ones_like(diagonal), where=diagonal > 0))
     scaled = fisher * scale[:, np.newaxis] * scale[..., np.newaxis]
     information, directions = np.linalg.eigh(scaled)
