@@ -129,9 +129,6 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
     table_ = emissivity.embedded_table() if materials is None else materials
     # Numbers of the scene, which the page holds as JSON.
     (rows, columns), frames, seconds = view.shape, view.time.size, float(np.ptp(view.time))
-    sentence = f"{rows} rows of {columns} pixels, {frames} frames in {seconds:.1f} s"
-    if "method" in result.attrs:
-        sentence += f"; separated by the method '{result.attrs['method']}'"
     numbers: dict[str, Any] = {
         "scene": {"rows": rows, "columns": columns, "frames": frames, "duration_s": seconds},
         "validity": _validity(view),
@@ -146,17 +143,16 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
     if view.capture is not None and view.response is not None:
         doubts += against_response(view.capture, view.response)
     unit, zero = view.panes["object_temperature"].unit(celsius=celsius)
-    emissivities = _emissivities(numbers, named=bool(regions))
+    bands = [name.removeprefix("emissivity ") for name in shown if name not in FILMS]
     page, script = (resources.files(__package__) / name for name in ("page.html", "viewer.js"))
     environment = Environment(autoescape=True, trim_blocks=True)
     text = environment.from_string(page.read_text("utf-8")).render(
         title=title,
         origin=result.attrs.get("origin") or shot.attrs.get("origin", "origin not stated"),
-        about=", ".join(filter(None, about)),
+        about=about,
         answer=sentences,
         logo="" if logo is None else base64_text(_picture(logo)),
         numbers=numbers,
-        scene=sentence,
         film=video(view, title, codec, celsius=celsius),
         viewer=viewer(view, celsius=celsius),
         outlines=_svg(_outlines(view, chosen, celsius=celsius)),
@@ -168,12 +164,12 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
         meanings={bit.label: bit.meaning for bit in Status},
         percent=drawing.percent,
         causes=schema.CAUSES,
-        emissivities=emissivities,
-        bands=[drawing.band_label(band) for band in result["band"].values] if emissivities else [],
+        described=bool(numbers["answer"]["materials"] or (regions and bands)),
+        named=bool(regions),
+        bands=[drawing.band_label(band) for band in bands],
         spread=SPREAD,
         attrs=result.attrs,
-        events=", ".join(f"{name} ({moment:.1f} s)" for name, moment in view.events.items()),
-        text=_shown,
+        events=view.events,
         provenance=json.dumps(made_by, indent=2, sort_keys=True),
         script=Markup(script.read_text("utf-8")),
         json=lambda value: htmlsafe_json_dumps(value, allow_nan=False, sort_keys=True),
@@ -286,29 +282,9 @@ def _summary(curves: Mapping[str, xr.Dataset], materials: xr.Dataset) -> dict[st
     return summary
 
 
-def _emissivities(numbers: Mapping[str, Any], *, named: bool) -> list[list[str]]:
-    """Emissivities of materials, and of named regions, beside the nearest known: rows of text."""
-    places = {f"{entry['pixels']} pixels alike": entry for entry in numbers["answer"]["materials"]}
-    if named:
-        places |= {name: of for name, of in numbers["regions"].items() if of.get("emissivity")}
-    rows = []
-    for name, of in places.items():
-        pairs = zip(of["emissivity"].values(), of["emissivity_std"].values(), strict=True)
-        cells = [f"{_shown(value)} \N{PLUS-MINUS SIGN} {_shown(std)}" for value, std in pairs]
-        steady = of.get("emissivity_steady_std", {}).values()
-        cells = [f"{cell} ({std:.4f})" for cell, std in zip(cells, steady, strict=False)] or cells
-        near = [f"{row['material']} ({row['distance']:.1f})" for row in of["nearest"]]
-        rows.append([name, ", ".join(near) or "many", *cells])
-    return rows
-
-
 def _plain(value: Any) -> float | None:
     """Number for JSON; None if it is not finite."""
     return float(value) if np.isfinite(value) else None
-
-
-def _shown(value: float | None) -> str:
-    return "no value" if value is None else f"{value:.3f}"
 
 
 def _films(view: View) -> list[str]:

@@ -98,10 +98,6 @@ class FaultyApt(EmulatedApt):
         joined = b"".join(due)
         return [bytes([byte]) for byte in joined] if self.faults.single_bytes else [joined]
 
-    def next_due(self) -> float:
-        """Time until something may be due [s]."""
-        return 0.0 if self._waiting else super().next_due()
-
     def reply(self, identifier: Id, *arguments: Any, **options: Any) -> None:
         """Send an answer or a report, or lose it, change its form or add to it by a fault."""
         if identifier in _ENDS - {Id.MOT_MOVE_HOMED} and self.faults.long_reports:

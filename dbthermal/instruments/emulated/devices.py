@@ -34,7 +34,7 @@ from dbthermal.instruments.transport import Closing, TransportError
 
 Numbers = MutableSequence[Any]  # a ctypes array of the caller, written in place
 
-TICK: Final = 0.01  # shortest wait until a device is asked again if it has something to say [s]
+TICK: Final = 0.01  # wait until a device is asked again if it has something to say [s]
 FRAME_RATE: Final = 60  # frames per second of a camera whose frames no source counts [Hz]
 SERIAL_NUMBER: Final = 40_000_000
 SLOWEST: Final = 1.0  # [count/s] velocity below which the motor does not move at all
@@ -64,10 +64,6 @@ class Line(Closing):
         replies, self._replies = self._replies, []
         return replies
 
-    def next_due(self) -> float:
-        """Time until something may be due [s]; infinite if it waits for bytes."""
-        return 0.0 if self._replies else math.inf
-
     def write(self, data: bytes) -> None:
         """Send all bytes; see `Transport.write`."""
         with self._lock:
@@ -86,11 +82,10 @@ class Line(Closing):
                     if piece[size:]:
                         self._pieces.insert(0, piece[size:])
                     return piece[:size]
-                pause = max(self.next_due(), TICK)
             remaining = deadline - self.clock()
             if remaining <= 0:
                 return b""
-            self.clock.sleep(min(remaining, pause))
+            self.clock.sleep(min(remaining, TICK))
 
     def close(self) -> None:
         """End; a second call does nothing."""
@@ -222,12 +217,6 @@ class EmulatedApt(Line):
         """Messages that are due to be sent now."""
         self._advance()
         return super().poll()
-
-    def next_due(self) -> float:
-        """Time until a message or the end of a motion is due [s]."""
-        if self._replies or self._drive is None:
-            return super().next_due()
-        return max(0.0, self._drive.start + self._drive.duration - self.world.clock())
 
     def obey(self, message: _apt.Message) -> None:
         """Carry out a message; an unknown one is ignored."""
