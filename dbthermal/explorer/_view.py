@@ -149,9 +149,8 @@ class View:
 
     def limits(self, name: str) -> tuple[float, float]:
         """Range of colour of a pane: 1st and 99th percentile of some values, measured if any is."""
-        pane, (frames, pixels) = self.pane(name), _RANGE
-        times = slice(0, None, -(-self.time.size // frames))
-        every = slice(0, None, stride(self.shape, pixels))
+        pane, times = self.pane(name), slice(0, None, -(-self.time.size // _RANGE[0]))
+        every = slice(0, None, stride(self.shape, _RANGE[1]))
         values, good = pane.read(times, every, every), self.counted("measured")[every, every]
         for shown in (values[:, good], values):
             finite = shown[np.isfinite(shown)]
@@ -160,7 +159,8 @@ class View:
                 low = 0.0 if "_std" in name else low
                 if pane.std and not pane.absolute:  # emissivities within their bars are alike
                     bars = self.pane(pane.std).read(times, every, every)[np.isfinite(values)]
-                    low, high = low - np.median(bars), high + np.median(bars)
+                    margin = np.median(np.nan_to_num(bars))  # a missing bar widens no range
+                    low, high = low - margin, high + margin
                 return float(low), float(high if high > low else low + (1e-3 * abs(low) or 1.0))
         return 0.0, 1.0
 

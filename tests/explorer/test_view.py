@@ -200,6 +200,15 @@ def answer(explorer: Any, **question: Any) -> tuple[dict[str, Any], list[bytes]]
     return result
 
 
+def test_a_missing_deviation_leaves_the_range_of_colour() -> None:
+    """Colours of an emissivity have a range where its deviation lacks at a pixel, or at all."""
+    data = separated()
+    for pixels in (0, slice(None)):
+        data["emissivity_std"].values[:, pixels] = np.nan
+        low, high = View(data).limits("emissivity 9.5")
+        assert low < high
+
+
 def test_exported_files(tmp_path: Path) -> None:
     """CSV and NetCDF have the curves, TIFF and NetCDF the frame, PNG a picture; by suffix alone."""
     explorer = dbthermal.explore(separated())
