@@ -17,7 +17,7 @@ from PIL import Image
 from dbthermal import figures, store
 from dbthermal.explorer._films import Region
 from dbthermal.explorer._view import Pixels, View
-from dbthermal.figures import drawing, legend
+from dbthermal.figures import FilmPanel, drawing, legend
 
 ANIMATED: Final = (".gif", ".webp")
 SUFFIXES: Final = (".csv", ".tiff", ".png", ".nc", *ANIMATED)
@@ -87,9 +87,7 @@ def sampled(
     return xr.DataArray(values - zero, {"time": time}, ("time", "y", "x")), step
 
 
-def panels(
-    view: View, shown: Shown, frames: int, samples: float = np.inf
-) -> list[figures.FilmPanel]:
+def panels(view: View, shown: Shown, frames: int, samples: float = np.inf) -> list[FilmPanel]:
     """Pictures of a film of the panes that change, of at most so many frames and samples each."""
     made = []
     for pane in (view.pane(name) for name in shown.names if view.pane(name).kind == "film"):
@@ -97,7 +95,7 @@ def panels(
         low, high = shown.limits.get(pane.name) or view.limits(pane.name)
         film, _ = sampled(view, pane.name, frames, samples, celsius=shown.celsius)
         style: dict[str, Any] = {"limits": (low - zero, high - zero), "palette": shown.palette}
-        made.append(figures.FilmPanel(film, pane.label, f"[{unit}]", **style))
+        made.append(FilmPanel(film, pane.label, f"[{unit}]", **style))
     return made
 
 

@@ -6,7 +6,6 @@ those of a blackbody. See `dbthermal.instruments.protocols` for whole procedures
 """
 
 from collections.abc import Mapping
-from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final
 
@@ -207,13 +206,13 @@ def open_sweep(folder: str | Path, name: str, *, frames: int) -> xr.Dataset:
         Attributes as `calibration.fit_response` takes them, where the session states its accuracy.
     """
     steps, stability, shared = _sweep(folder, name)
-    movies = [(_agreed(paths, BLACKBODY, stability), _movie(paths, frames)) for paths in steps]
-    movies.sort(key=itemgetter(0))
-    attrs = schema.COORDINATES["temperature"].attrs
-    axis = xr.Variable("temperature", [temperature for temperature, _ in movies], attrs)
-    counts = xr.concat([movie for _, movie in movies], "temperature")
-    counts = counts.transpose("band", "temperature", "frame", "y", "x")
-    joined = counts.to_dataset(name="counts").assign_coords(temperature=axis)
+    movies = [
+        _movie(paths, frames).expand_dims(temperature=[_agreed(paths, BLACKBODY, stability)])
+        for paths in steps
+    ]
+    counts = xr.concat(movies, "temperature").sortby("temperature")
+    counts["temperature"].attrs = schema.COORDINATES["temperature"].attrs
+    joined = counts.transpose("band", "temperature", "frame", "y", "x").to_dataset(name="counts")
     return schema.check(joined.assign_attrs(shared), "blackbody_movies")
 
 
