@@ -9,6 +9,7 @@ import sys
 import zipfile
 import zlib
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import google_crc32c
@@ -91,6 +92,7 @@ class Quantity(np.ndarray[Any, Any]):
 
 
 FRAMES = xr.DataArray(scene(), dims=("time", "y", "x"), name="frames")
+UNKNOWN = SimpleNamespace(shape=(np.nan, 8, 8), dtype=np.dtype("u2"), ndim=3)  # of dask
 MILLISECONDS = xr.DataArray(100.0 * np.arange(3), dims="time", attrs={"units": "ms"})
 
 
@@ -110,6 +112,7 @@ MILLISECONDS = xr.DataArray(100.0 * np.arange(3), dims="time", attrs={"units": "
         (scene()[0], {}, r"Invalid shape \(24, 32\) of 'array'"),
         (scene()[:0], {}, r"Invalid shape \(0, 24, 32\) of .*Must be \(time, y, x\), not 0"),
         (scene().tolist(), {}, "Invalid dtype int64 of 'array'"),
+        (UNKNOWN, {}, r"Invalid shape \(nan, 8, 8\) of 'array'"),
         *((scene(), {"memory": it}, "memory.*Must be (a n|fin)") for it in ("1e9", np.nan, True)),
         (scene(), {"unit": ["count"]}, "unit.*Must be 'count'"),
         (scene(), {"clock": None}, "Missing clock= for 'array', which tells no times"),
@@ -325,17 +328,6 @@ def test_a_frame_rate_in_a_file_is_compared_with_the_clock(tmp_path: Path, place
     assert "warnings" not in read(path, clock=25.0).attrs
     with pytest.warns(UserWarning, match=rf"'{path.name}' states 25 frames a second, and clock="):
         read(path, clock=10.0)
-
-
-def test_missing_counts_of_a_file(tmp_path: Path) -> None:
-    """A fill value that occurs is refused."""
-    group = zarr.open_group(tmp_path / "a.zarr", mode="w", zarr_format=3)
-    frames = group.create_array("frames", data=scene())
-    frames.attrs["_FillValue"] = 0
-    assert_array_equal(read(tmp_path / "a.zarr").counts, scene())
-    frames.attrs["_FillValue"] = int(scene()[1, 2, 3])
-    with pytest.raises(ValueError, match=r"Missing counts in 'a\.zarr': \[[\d.]+\]\. Must all"):
-        read(tmp_path / "a.zarr")
 
 
 @pytest.mark.parametrize("form", ["h5", "nc", "zarr2", "zarr3"])
@@ -749,15 +741,3 @@ def test_shards_that_end_beyond_the_frames(tmp_path: Path, frames: int) -> None:
     options: dict[str, Any] = {"chunks": (1, 12, 16), "shards": (2, 36, 32)}
     zarr.create_array(tmp_path / "a.zarr", data=counts, **options)
     assert_array_equal(read(tmp_path / "a.zarr").counts, counts)
-
-
-def test_arrays_of_unknown_size() -> None:
-    """Of dask, after a selection by values: the shape is named."""
-
-    class Unknown:
-        """Array of which the number of frames is not known."""
-
-        shape, dtype, ndim = (float("nan"), 8, 8), np.dtype("u2"), 3
-
-    with pytest.raises(ValueError, match=r"Invalid shape \(nan, 8, 8\) of 'array'"):
-        read(Unknown())

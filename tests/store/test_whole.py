@@ -93,18 +93,6 @@ def test_two_threads_at_one_place(tmp_path: Path) -> None:
     assert names(tmp_path) == ["a.md"]
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
-def test_a_signal_leaves_nothing(tmp_path: Path, number: signal.Signals) -> None:
-    """The earlier output stays, nothing is beside it, and the program ends by the signal."""
-    store.save_text("earlier", tmp_path / "a.md", {})
-    with writer(tmp_path / "a.md") as process:
-        process.send_signal(number)
-        status = process.wait(60)
-    assert status in {-number, 128 + number}
-    assert names(tmp_path) == ["a.md"]
-    assert (tmp_path / "a.md").read_text().startswith("earlier")
-
-
 def test_an_earlier_store_comes_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Between its two renames an error, or the next writer after a kill, puts it in its place."""
     path, first = tmp_path / "a.zarr", xr.Dataset({"counts": ("time", np.arange(3))})
