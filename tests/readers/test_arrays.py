@@ -359,7 +359,8 @@ def test_arrays_in_other_files_are_refused(tmp_path: Path) -> None:
 def test_what_is_no_file_of_arrays(tmp_path: Path, name: str) -> None:
     """Bytes of no format are so named, whatever the suffix; a folder of pictures is no zarr."""
     (tmp_path / name).write_bytes(bytes(range(200, 250)))
-    with pytest.raises(ValueError, match=f"Invalid '{name}': of no format, by its first bytes"):
+    rule = r"of no format, by its first bytes.*Must be \.npy, \.npz, HDF5"
+    with pytest.raises(ValueError, match=f"Invalid '{name}': {rule}"):
         read(tmp_path / name)
     with pytest.raises(ValueError, match=r"Invalid folder '.*', no whole zarr.* files: .*\.tif"):
         read(tmp_path)
@@ -426,9 +427,6 @@ def test_objects_are_not_loaded(tmp_path: Path) -> None:
         read(path, memory=100)
     path.write_bytes(path.read_bytes().replace(b"(3, 24, 32)", b"(9, 99, 99999)"[:11]))
     with pytest.raises(ValueError, match=r"Damaged|Truncated"):
-        read(path)
-    path.write_bytes(b"nothing at all")
-    with pytest.raises(ValueError, match=r"Invalid 'a\.npy': .*Must be \.npy, \.npz, HDF5"):
         read(path)
 
 

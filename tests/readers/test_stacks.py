@@ -56,13 +56,10 @@ def test_stacks_come_back(tmp_path: Path, form: str) -> None:
 
 
 def test_frames_appended_one_by_one(tmp_path: Path) -> None:
-    """Each has a description of one image; one of another size is named."""
+    """Each has a description of one image."""
     for image in scene():
         write(path := tmp_path / "a.tif", image, append=True)
     assert_array_equal(read(path).counts, scene())
-    write(path, scene()[0, :9], append=True)
-    with pytest.raises(ValueError, match=r"page of \(9, 32\) in 'a.tif'\. Must be \(24, 32\)"):
-        read(path)
 
 
 def test_one_file_a_frame(tmp_path: Path) -> None:
@@ -76,7 +73,9 @@ def test_one_file_a_frame(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"'b\.tif' are those of the file before, or none"):
         read([tmp_path / "a.tif", tmp_path / "b.tif"])
     write(paths[1], scene()[0, :-1])
-    with pytest.raises(ValueError, match=r"Invalid page of \(23, 32\) in 'frame9\.tif'"):
+    with pytest.raises(
+        ValueError, match=r"page of \(23, 32\) in 'frame9\.tif'\. Must be \(24, 32\)"
+    ):
         read(paths)
 
 
