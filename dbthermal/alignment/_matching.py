@@ -37,8 +37,8 @@ _ROUGH: Final = 0.5  # assumed deviation of a whole-pixel match [pixel]
 # Parts along a side of the image, for a delay's jackknife; pixels that give a movie's noise.
 _PARTS, _NOISE_PIXELS = 6, 256
 # Determinant of a window's information over the square of its trace, at least: with 0.02, 0.1 and
-# 0.25 shifts before lamps are 0.068, 0.063, 0.038 pixel off, before fans 0.023, 0.023, 0.029 (medians
-# of 10 scenes), and of a still object before people .945, .945, .929 of the intervals hold.
+# 0.25 shifts before lamps are 0.068, 0.063, 0.038 pixel off, before fans 0.023, 0.023, 0.029
+# (medians of 10 scenes); of a still object before people .945, .945, .929 of the intervals hold.
 _LEAST_AREA: Final = 0.1
 _TINY: Final = float(np.finfo(np.float64).tiny)
 _RIDGE: Final = 1e-4  # of the largest information on a shift, added for windows without any
