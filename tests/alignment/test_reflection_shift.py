@@ -305,7 +305,7 @@ def test_the_last_pair_of_displaced_cameras_is_in_the_bars() -> None:
 def holds(result: xr.Dataset, warm: xr.DataArray) -> None:
     """Check that a shift is found, and intervals hold in most of the many pixels without a flag."""
     sound = result["status"].values == 0
-    error = np.abs(result["object_temperature"] - warm).values
+    error = np.abs(result["object_temperature"].values - warm.values)
     share = np.mean((error < 1.96 * result["object_temperature_std"].values)[:, sound])
     print(f"{sound.mean():.2f} without a flag, {share:.3f} hold")
     assert result.attrs["reflection_shift"] == "found"
