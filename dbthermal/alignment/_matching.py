@@ -57,12 +57,7 @@ class Movies:
 
     @classmethod
     def blurred(
-        cls,
-        movies: list[Movie],
-        valid: Mask,
-        noise: Array,
-        freedom: float,
-        factor: int,
+        cls, movies: list[Movie], valid: Mask, noise: Array, freedom: float, factor: int
     ) -> "Movies":
         """Movies of pixels that are so many times coarser than the mask's."""
         mostly = images.binned(valid.astype(np.float64), factor) > 0.5

@@ -401,7 +401,9 @@ def status(result: xr.Dataset) -> Figure:
         Patch(facecolor=color, edgecolor="0.5", label=f"{drawing.percent(share)}  {words}")
         for words, color, share in shown
     ]
-    legend_axis.legend(handles=patches, loc=2, borderaxespad=0.0, frameon=False, fontsize=9)
+    legend_axis.legend(
+        handles=patches, loc="upper left", borderaxespad=0.0, frameon=False, fontsize=9
+    )
     shares = {words: share for words, _, share in shown}
     completed = sum(share for words, share in shares.items() if "completed" in words)
     good = f"{drawing.percent(shares.get(_GOOD[0], 0.0))} of the pixels have no flag"
