@@ -6,7 +6,6 @@ much later the others show what the first shows.
 """
 
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Final
 
 import numpy as np
@@ -36,11 +35,9 @@ _USUAL: Final = 0.95  # share of a pixel's samples that are no rare change
 _ROUGH: Final = 0.5  # assumed deviation of a whole-pixel match [pixel]
 # Parts along a side of the image, for a delay's jackknife; pixels that give a movie's noise.
 _PARTS, _NOISE_PIXELS = 6, 256
-# Determinant of a window's information over the square of its trace, at least: with 0.02, 0.1 and
-# 0.25 shifts before lamps are 0.068, 0.063, 0.038 pixel off, before fans 0.023, 0.023, 0.029
-# (medians of 10 scenes); of a still object before people .945, .945, .929 of the intervals hold.
-_LEAST_AREA: Final = 0.1
-_TINY: Final = float(np.finfo(np.float64).tiny)
+# Share of the changes from which one function of time holds all: before lamps 0.99 to 1, before
+# people, hands and fans 0.1 to 0.5, of switched spots up to 0.97.
+_ALONE: Final = 0.98
 _RIDGE: Final = 1e-4  # of the largest information on a shift, added for windows without any
 
 
@@ -53,11 +50,18 @@ class Movies:
     valid: Mask  # pixels (y, x) with data in all
     noise: Array  # standard deviation of a sample before the blur, first and others [K]
     freedom: float  # degrees of freedom of a pixel's noise
+    outside: float  # degrees of freedom of what a model leaves over these [1]
     factor: int  # pixels of the capture along a side of a pixel here
 
     @classmethod
     def blurred(
-        cls, movies: list[Movie], valid: Mask, noise: Array, freedom: float, factor: int
+        cls,
+        movies: list[Movie],
+        valid: Mask,
+        noise: Array,
+        freedom: float,
+        factor: int,
+        whole: float,
     ) -> "Movies":
         """Movies of pixels that are so many times coarser than the mask's."""
         mostly = images.binned(valid.astype(np.float64), factor) > 0.5
@@ -70,7 +74,13 @@ class Movies:
             noise = np.minimum(noise, np.array(usual) / white)
         first = images.splines(movies[0], BLUR)
         others = [images.blurred(movie, BLUR) for movie in movies[1:]]
-        return cls(first, others, mostly, noise / factor, freedom, factor)
+        # What a model leaves lies all over the frames; but where one function of time holds the
+        # changes, as of a lamp, in this one, and a border of materials bends the field.
+        energy = np.sum(np.square(first, dtype=np.float64), axis=(0, 1))
+        energy -= first[..., 0].size * (noise[0] / factor * _VALUE_NOISE) ** 2
+        alone = energy.max() > _ALONE * np.maximum(energy, 0.0).sum()
+        outside = 1.0 / freedom if alone else max(whole / freedom, 1.0)
+        return cls(first, others, mostly, noise / factor, freedom, outside, factor)
 
     def centres(self) -> list[Array]:
         """Rows and columns, of the capture, of the pixels' centres."""
@@ -129,30 +139,29 @@ def _information(movies: Movies, shift: Array) -> Information:
 
     .. math:: A = k^2 \sum_t g g^T / s^2, \quad b = k \sum_t g r / s^2
 
-    less what noise makes of the slopes; s^2 is the variance of r along g in the window, as of a
-    sandwich estimator (White 1980, doi:10.2307/1912934), and not less than the noise's.
+    less what noise makes of the slopes; s^2 is the noise's variance where the residual is noise,
+    and larger where it is not.
     """
     places, used = movies.pairs(shift)
     noise = movies.noise[0] * _VALUE_NOISE
     total = np.zeros((*used.shape, 6))
-    window = partial(gaussian_filter, sigma=WINDOW)
-    number = np.maximum(window(used * movies.freedom), 1e-9)
+    number = np.maximum(gaussian_filter(used * movies.freedom, WINDOW), 1e-9)
     moments = images.products(movies.first, movies.others, places) * used[..., np.newaxis]
     for sums, level in zip(moments, movies.noise[1:], strict=True):
-        _, my, mx, _, yy, yx, yh, xx, xh, _ = np.moveaxis(sums, 2, 0)
+        mm, my, mx, mh, yy, yx, yh, xx, xh, hh = np.moveaxis(sums, 2, 0)
         auto, terms = np.moveaxis(images.blurred(sums[..., [0, 3]], WINDOW), 2, 0)
         # Noise of the moved movie makes its energy larger, not its product with another movie.
         auto -= number * noise**2
         ratio = terms / np.maximum(auto, 0.1 * number * noise**2)
         # Summed over pixels, the noise is that before the blur.
         variance = level**2 + (ratio * movies.noise[0]) ** 2
-        force = np.stack([yh - ratio * my, xh - ratio * mx])
-        expected = np.maximum(variance * _VALUE_NOISE**2 * window(yy + xx), _TINY)
-        misfit = np.maximum(_scatter(ratio * np.stack([yy, yx, xx]), force) / expected, 1.0)
+        residual = gaussian_filter(hh - 2.0 * ratio * mh + ratio**2 * mm, WINDOW)
+        excess = residual / (variance * _VALUE_NOISE**2) - number
+        misfit = np.maximum(1.0 + excess / (number * movies.outside), 1.0)
         weight = used * ratio / (misfit * variance)
         less = ratio * movies.freedom * (movies.noise[0] * _SLOPE_NOISE) ** 2
         squares = ratio * yy - less, ratio * yx, ratio * xx - less
-        terms = np.stack([*squares, *force, less], axis=-1)
+        terms = np.stack([*squares, yh - ratio * my, xh - ratio * mx, less], axis=-1)
         total += weight[..., np.newaxis] * terms
     total = np.moveaxis(images.blurred(total, WINDOW), 2, 0)
     tensor, gradient, less = total[:3], total[3:5], total[5]
@@ -161,24 +170,6 @@ def _information(movies: Movies, shift: Array) -> Information:
     share = np.maximum(size, 0.0) / np.maximum(size + less, 1e-300)
     tensor, gradient = _positive(tensor) * share, gradient * share
     return Information(tensor / movies.factor**2, gradient / movies.factor)
-
-
-def _scatter(tensor: Array, force: Array) -> Array:
-    """Mean square (y, x) of forces (2, y, x) about the step of each window, of tensors (3, y, x).
-
-    A residual that is no noise lies in the picture's own functions of time, and moves the field:
-    before a lamp, which has one, at the borders of materials. A shift that is still off is none.
-    """
-    window = partial(gaussian_filter, sigma=WINDOW, axes=(-2, -1))
-    down, mixed, right = window(tensor)
-    pull_down, pull_right = window(force)
-    # Texture along one direction alone tells no step across it.
-    area = np.maximum(down * right - mixed**2, _LEAST_AREA * (down + right) ** 2 + _TINY)
-    step_down = (right * pull_down - mixed * pull_right) / area
-    step_right = (down * pull_right - mixed * pull_down) / area
-    down, mixed, right = tensor
-    explained = [down * step_down + mixed * step_right, mixed * step_down + right * step_right]
-    return np.asarray(window(np.square(force - explained).sum(axis=0)))
 
 
 def eigenvalues(tensor: Array) -> tuple[Array, Array]:

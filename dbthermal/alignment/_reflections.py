@@ -88,13 +88,13 @@ def shift_of(corrected: xr.Dataset, scale: Scale) -> xr.Dataset:
     # Planes of both periods in one reading of the films: slower changes show more of a delay.
     slow = min((longer for longer in tried if longer >= max(period, _SLOW)), default=max(tried))
     functions = [tried[length] for length in sorted({period, slow})]
-    movies = capture.planes(functions)
+    movies, white = capture.planes(functions), planes.white(capture.frames.size, period)
 
     def level(place: int, factor: int) -> Movies:
         """Movies of the changes within one of the periods, of coarser pixels."""
         pictures = [binned(movie, factor) for movie in movies[place]]
         freedom = float(np.sum(functions[place] ** 2))  # of white noise
-        return Movies.blurred(pictures, capture.valid, capture.noise, freedom, factor)
+        return Movies.blurred(pictures, capture.valid, capture.noise, freedom, factor, white)
 
     # From coarser pixels to those of the capture.
     while factor > 2:
@@ -143,7 +143,7 @@ def _coarse(
         functions = tried[period][:, :_FEW]
         white, freedom = planes.white(frames, period), float(np.sum(functions**2))
         pictures = [signal @ functions for signal in signals]
-        level = Movies.blurred(pictures, valid, capture.noise, freedom, factor)
+        level = Movies.blurred(pictures, valid, capture.noise, freedom, factor, white)
         begin = None if result is None else result[-1]
         if begin is None:
             # Whole frames, of which what is rare in a pixel's time is cut.
