@@ -251,9 +251,16 @@ def change(inputs: Inputs, loose: Whole, result: xr.Dataset, threads: Executor) 
     # Smoothed, it is the change of e_1 u_1(x) and holds little of the reflection's change.
     curves = moved @ functions.functions
     # The reflection's slow part is as large as its rapid part lets expect.
+    error, (frames, columns) = moved - curves @ functions.functions.T, functions.functions.shape
     rapid, first = smooth.rapid(inputs.capture["time"].values.astype(np.float64))
-    squares = (rapid.T @ (moved - curves @ functions.functions.T).T) ** 2
-    variance = smooth.energy_below(squares, first) / len(functions.functions)
+    variance = smooth.energy_below((rapid.T @ error.T) ** 2, first) / frames
+    # In pieces of time the rapid part is the object's, too: there as of the mean of correlated
+    # errors, K / N, times (1 + rho) / (1 - rho).
+    divided = inputs.division[:, loose].any(axis=0)
+    energy, lagged = (error**2).sum(axis=1), (error[:, 1:] * error[:, :-1]).sum(axis=1)
+    lagged = np.nan_to_num(np.clip(lagged / energy, 0.0, 0.98))
+    correlated = energy * columns / frames**2 * (1.0 + lagged) / (1.0 - lagged)
+    variance = np.where(divided, correlated, variance)
     bend = bend[unlike] @ functions.functions @ functions.object_part.T
     variance[unlike] += np.mean(bend**2, axis=1)
     # One that is not known, beside bad pixels, may be as large as any other.
