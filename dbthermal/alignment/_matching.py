@@ -37,7 +37,7 @@ _ROUGH: Final = 0.5  # assumed deviation of a whole-pixel match [pixel]
 _PARTS, _NOISE_PIXELS = 6, 256
 # Share of the changes from which one function of time holds all: before lamps 0.99 to 1, before
 # people, hands and fans 0.1 to 0.5, of switched spots up to 0.97.
-_ALONE: Final = 0.98
+_LEADING: Final = 0.98
 _RIDGE: Final = 1e-4  # of the largest information on a shift, added for windows without any
 
 
@@ -78,8 +78,8 @@ class Movies:
         # changes, as of a lamp, in this one, and a border of materials bends the field.
         energy = np.sum(np.square(first, dtype=np.float64), axis=(0, 1))
         energy -= first[..., 0].size * (noise[0] / factor * _VALUE_NOISE) ** 2
-        alone = energy.max() > _ALONE * np.maximum(energy, 0.0).sum()
-        outside = 1.0 / freedom if alone else max(whole / freedom, 1.0)
+        is_lamp = energy.max() > _LEADING * np.maximum(energy, 0.0).sum()
+        outside = 1.0 / freedom if is_lamp else max(whole / freedom, 1.0)
         return cls(first, others, mostly, noise / factor, freedom, outside, factor)
 
     def centres(self) -> list[Array]:

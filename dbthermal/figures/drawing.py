@@ -118,7 +118,8 @@ def limits_of(image: xr.DataArray, *, symmetric: bool = False) -> tuple[float, f
         return 0.0, 1.0
     lowest, highest = np.percentile(values, [1, 99])
     if symmetric:
-        lowest, highest = np.array([-1.0, 1.0]) * max(abs(lowest), abs(highest))
+        highest = max(abs(lowest), abs(highest))
+        lowest = -highest
     return float(lowest), float(highest) if highest > lowest else float(lowest) + 1.0
 
 

@@ -345,7 +345,8 @@ def clocked(counts: Counts, clock: Any, name: str, *sentences: str, **attrs: str
     seconds = stamps(clock, len(counts), name)
     _check_unsigned(counts, name)
     made = recording(counts, seconds, name, {"source": name, **attrs})
-    doubts = [] if sentences else _time_elsewhere(counts, name)  # or, of rows cut elsewhere, those
+    is_cut = sentences and attrs["format"] == "raw"  # at another size: frames are in no order
+    doubts = [] if is_cut else _doubts_on_order(counts, name)
     if (late := np.flatnonzero(made["frame_flags"].values & FileFlag.FRAMES_LOST_BEFORE)).size:
         steps = np.diff(seconds)
         missing = np.rint(steps[late - 1] / np.percentile(steps, 50, method="lower") - 1.0).sum()
@@ -355,7 +356,7 @@ def clocked(counts: Counts, clock: Any, name: str, *sentences: str, **attrs: str
     return warned(made, *sentences, *doubts)
 
 
-def _time_elsewhere(counts: Counts, name: str) -> list[str]:
+def _doubts_on_order(counts: Counts, name: str) -> list[str]:
     """Sentence on counts (time, y, x) whose time may be along another axis, or of bands in turn."""
     sides = [slice(max(0, (n - _ALONG) // 2), (n + _ALONG) // 2) for n in counts.shape]
     middle = counts[tuple(sides)]

@@ -205,7 +205,7 @@ def _on_one_clock(
     # Not if a band lacks more samples than can be bridged: at steps none is interpolated.
     lost = ~schema.measured(_samples.some_pixels(aligned["counts"]))
     retry = outcome if lost.mean(axis=(1, 2)).max() > MOST_BRIDGED else once(aligned)
-    # Nor if the reflections' shift is lost.
+    # Nor if it leaves a displacement that no shift explains.
     less = retry[0].asynchronous < _LESS * share
     if not less or len(retry[0].doubts) > len(outcome[0].doubts):
         return unchanged

@@ -243,11 +243,7 @@ def test_refuses_a_shift_beyond_a_third_of_the_image() -> None:
 
 
 def lamp(
-    seed: int,
-    shift: int,
-    texture: float,
-    emissivity: list[list[float]],
-    bend: float = 0.0,
+    seed: int, shift: int, texture: float, emissivity: list[list[float]], bend: float = 0.0
 ) -> tuple[xr.Dataset, xr.DataArray]:
     """Capture of a lamp whose picture the cameras see displaced, before two materials; the object.
 
@@ -261,8 +257,8 @@ def lamp(
     heating = rise * (1.0 + bend * np.sin(2.0 * np.pi * np.arange(80) / 40.0))
     warm = np.broadcast_to(300.0 + heating, (250, 64, 80))
     right = np.add.outer(0.5 * np.arange(64), np.arange(80)) > 50
-    plastic = GLASS * xr.DataArray(np.ones((64, 80)), dims=("y", "x"))
-    plastic = plastic.copy(data=np.transpose(emissivity)[:, right.astype(int)])
+    of_pixel = np.transpose(emissivity)[:, right.astype(int)]
+    plastic = xr.DataArray(of_pixel, {"band": GLASS["band"]}, ("band", "y", "x"))
     scene = simulation.scene(time, warm, warm, plastic)
     lamps = [295.0 + lit * view for view in (picture[:, :80], picture[:, shift:])]
     dims = ("band", *scene["object_temperature"].dims)

@@ -265,6 +265,10 @@ def test_frames_of_bands_in_turn_are_named() -> None:
         film = scene(24) // 9 + levels  # object and noise change little
         with pytest.warns(UserWarning, match=f"are like those {bands} later, not like the next"):
             read(film)
+    # Beside another warning, too.
+    stated = xr.DataArray(film, dims=("time", "y", "x"), attrs={"fps": 25.0})
+    with pytest.warns(UserWarning, match="25 frames"), pytest.warns(UserWarning, match="3 later"):
+        read(stated)
 
 
 def test_dates_of_an_array_agree_with_the_clock() -> None:

@@ -251,7 +251,8 @@ def change(inputs: Inputs, loose: Whole, result: xr.Dataset, threads: Executor) 
     # Smoothed, it is the change of e_1 u_1(x) and holds little of the reflection's change.
     curves = moved @ functions.functions
     # The reflection's slow part is as large as its rapid part lets expect.
-    error, (frames, columns) = moved - curves @ functions.functions.T, functions.functions.shape
+    error = moved - curves @ functions.functions.T
+    frames, columns = functions.functions.shape
     rapid, first = smooth.rapid(inputs.capture["time"].values.astype(np.float64))
     variance = smooth.energy_below((rapid.T @ error.T) ** 2, first) / frames
     # In pieces of time the rapid part is the object's, too: there as of the mean of correlated

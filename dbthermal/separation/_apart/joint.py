@@ -158,10 +158,10 @@ class Joint:
         unsolved = np.isnan(self.signals[0]).all(axis=0).reshape(status.shape)
         distance, near = distance_transform_edt(unsolved, return_indices=True)
         films = self.signals[:, looked_at(self.signals.shape[1])].reshape(2, -1, *status.shape)
-        apart = films[1] - films[0]
-        steps = [np.diff(apart, axis=axis) ** 2 for axis in (1, 2)]
+        difference = films[1] - films[0]
+        steps = [np.diff(difference, axis=axis) ** 2 for axis in (1, 2)]
         growth = sum(np.nansum(step) / max(np.isfinite(step).sum(), 1) for step in steps)
-        square = (apart**2).mean(axis=0)[near[0], near[1]] + growth * distance**2
+        square = (difference**2).mean(axis=0)[near[0], near[1]] + growth * distance**2
         share = (weights * self.emissivity)[1:].sum(0).reshape(status.shape)
         square = np.nan_to_num(unsolved * share**2 * square)
         factor = self.factor(threads).reshape(status.shape)
