@@ -144,7 +144,7 @@ def _bent(work: Work, frames: int) -> bool:
     return bent
 
 
-@inlined
+@kernels.merged
 def _pixel(
     model: Model, work: Work, films: Any, record: Any, vectors: Any, covariance: Any
 ) -> None:
@@ -153,8 +153,8 @@ def _pixel(
     for m in range(bands):
         kernels.copy(work.signals[m, :frames], work.straight[m, :frames])
         kernels.fill(work.removed[m, :frames], 0.0)
-    gray, rounds = False, 0
-    while True:
+    gray = False
+    for rounds in range(pixel.BENDS + 1):
         pixel.ratios(model, work, record)
         line = pixel.emission(model, record, work, rounds)
         pixel.background(model, work)
@@ -163,7 +163,6 @@ def _pixel(
             gray = pixel.may_be_gray(model, record, work)
         if rounds == pixel.BENDS or not _bent(work, frames):
             break
-        rounds += 1
         _straighten(work, bands, frames)
     bars.bars(model, record, line, work, covariance)
     _write(work, record, vectors)
@@ -387,7 +386,8 @@ def solve(
         numbers = (material.inverse_energy, material.emissivity)
         spreads = (material.noise_variance, material.drift_variance, material.spread)
         materials[:] = np.stack([*numbers, *spreads, *material.ratio], 1)
-    errors = np.stack([tile.scaled(tile.noise).T, tile.scaled(tile.pattern or (0.0,) * bands).T])
+    errors = np.empty((2, pixels, bands))  # in the order of `np.stack` it would be compiled anew
+    errors[:] = tile.scaled(tile.noise).T, tile.scaled(tile.pattern or (0.0,) * bands).T
     films = np.empty((4, frames, pixels), np.float32)
     record = np.zeros(pixels, RECORD).view(np.recarray)  # has its names also where not compiled
     sums = np.zeros((2, shared.parts.size - 1, pixels))

@@ -45,6 +45,8 @@ compiled: Final[Callable[..., Any]] = njit(fastmath=_FLAGS, **_OPTIONS)
 _WITHIN: Final[dict[str, Any]] = _OPTIONS | {"forceinline": True, "no_cpython_wrapper": True}
 inlined: Final[Callable[..., Any]] = njit(fastmath=_FLAGS, **_WITHIN)
 """As `compiled`, for what has a work space: to hand over its some 300 numbers takes long."""
+merged: Final[Callable[..., Any]] = njit(fastmath=_FLAGS, inline="always", **_WITHIN)
+"""As `inlined`, in one place, from the source: it is not compiled by itself first."""
 _numbers: Final[Callable[..., Any]] = njit(fastmath=_FLAGS | {"nnan"}, **_OPTIONS)
 
 
