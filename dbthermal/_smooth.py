@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import svd
 
 from dbthermal._arrays import Array, Mask, stretches
 from dbthermal._compiled import compiled
@@ -67,7 +68,8 @@ def leading(samples: npt.NDArray[Any], count: int) -> npt.NDArray[Any]:
     """Orthonormal functions of time (time, function) that hold most of samples (pixel, time)."""
     sample = np.asarray(samples[:: max(1, len(samples) // (_FOR_EACH * count))], np.float64)
     if len(sample) < sample.shape[1]:
-        sizes, functions = np.linalg.svd(sample, full_matrices=False)[1:]
+        # LAPACK's default algorithm, gesdd, does not converge on some samples that are finite.
+        sizes, functions = svd(sample, full_matrices=False, lapack_driver="gesvd")[1:]
     else:
         squares, functions = (array.T[::-1] for array in np.linalg.eigh(sample.T @ sample))
         sizes = np.sqrt(squares.clip(0.0))

@@ -6,6 +6,7 @@ much later the others show what the first shows.
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -51,6 +52,7 @@ class Movies:
     noise: Array  # standard deviation of a sample before the blur, first and others [K]
     freedom: float  # degrees of freedom of a pixel's noise
     outside: float  # degrees of freedom of what a model leaves over these [1]
+    lamp: bool  # one function of time holds nearly all changes
     factor: int  # pixels of the capture along a side of a pixel here
 
     @classmethod
@@ -78,9 +80,9 @@ class Movies:
         # changes, as of a lamp, in this one, and a border of materials bends the field.
         energy = np.sum(np.square(first, dtype=np.float64), axis=(0, 1))
         energy -= first[..., 0].size * (noise[0] / factor * _VALUE_NOISE) ** 2
-        is_lamp = energy.max() > _LEADING * np.maximum(energy, 0.0).sum()
-        outside = 1.0 / freedom if is_lamp else max(whole / freedom, 1.0)
-        return cls(first, others, mostly, noise / factor, freedom, outside, factor)
+        lamp = bool(energy.max() > _LEADING * np.maximum(energy, 0.0).sum())
+        outside = 1.0 / freedom if lamp else max(whole / freedom, 1.0)
+        return cls(first, others, mostly, noise / factor, freedom, outside, lamp, factor)
 
     def centres(self) -> list[Array]:
         """Rows and columns, of the capture, of the pixels' centres."""
@@ -135,17 +137,23 @@ def inside(places: Array, valid: Mask) -> Mask:
 def _information(movies: Movies, shift: Array) -> Information:
     r"""Information on a step of the field at each pixel, by Gauss-Newton.
 
-    With a ratio k for each window, the residual r of a pixel, and the slope g of the moved movie,
+    With a ratio k for each window, the moved movie m and its slopes g, the residual r of a pixel is
+    :math:`k \, g^T d + u m + \sigma^2 g^T \nabla (k + u)` beside noise: u, of a variance that the
+    window tells, is the pixel's ratio less the window's, as beside a border of materials, and a
+    blur by sigma of what has an uneven ratio moves it. So
 
-    .. math:: A = k^2 \sum_t g g^T / s^2, \quad b = k \sum_t g r / s^2
+    .. math:: A = k^2 \sum_t g g^T - q \, (g m)(g m)^T, \quad
+              b = k \sum_t g r - q \, (g m)(m r) - A \sigma^2 \nabla (k + u) / k,
+              \quad q = \frac{\tau^2}{s^2 + \tau^2 \sum_t m^2}
 
-    less what noise makes of the slopes; s^2 is the noise's variance where the residual is noise,
-    and larger where it is not.
+    over s^2, less what noise makes of the slopes; s^2 is the noise's variance where the residual is
+    noise, and larger where it is not.
     """
     places, used = movies.pairs(shift)
     noise = movies.noise[0] * _VALUE_NOISE
     total = np.zeros((*used.shape, 6))
-    number = np.maximum(gaussian_filter(used * movies.freedom, WINDOW), 1e-9)
+    window = partial(gaussian_filter, sigma=WINDOW)
+    number = np.maximum(window(used * movies.freedom), 1e-9)
     moments = images.products(movies.first, movies.others, places) * used[..., np.newaxis]
     for sums, level in zip(moments, movies.noise[1:], strict=True):
         mm, my, mx, mh, yy, yx, yh, xx, xh, hh = np.moveaxis(sums, 2, 0)
@@ -155,14 +163,24 @@ def _information(movies: Movies, shift: Array) -> Information:
         ratio = terms / np.maximum(auto, 0.1 * number * noise**2)
         # Summed over pixels, the noise is that before the blur.
         variance = level**2 + (ratio * movies.noise[0]) ** 2
-        residual = gaussian_filter(hh - 2.0 * ratio * mh + ratio**2 * mm, WINDOW)
-        excess = residual / (variance * _VALUE_NOISE**2) - number
+        white, along = variance * _VALUE_NOISE**2, mh - ratio * mm
+        # Before a lamp a step of the shift looks like another ratio: there a window has one.
+        uneven = 0.0 if movies.lamp else np.maximum(window(along**2) - white * window(mm), 0.0)
+        uneven /= np.maximum(window(mm**2), np.finfo(np.float64).tiny)
+        share = uneven / (white + uneven * mm)
+        residual = window(hh - 2.0 * ratio * mh + ratio**2 * mm - share * along**2)
+        excess = residual / white - number
         misfit = np.maximum(1.0 + excess / (number * movies.outside), 1.0)
         weight = used * ratio / (misfit * variance)
+        yy, yx, xx = yy - share * my**2, yx - share * my * mx, xx - share * mx**2
+        moved = BLUR**2 * np.stack(np.gradient(ratio + share * along))
+        steps = (
+            yh - ratio * my - share * my * along - yy * moved[0] - yx * moved[1],
+            xh - ratio * mx - share * mx * along - yx * moved[0] - xx * moved[1],
+        )
         less = ratio * movies.freedom * (movies.noise[0] * _SLOPE_NOISE) ** 2
         squares = ratio * yy - less, ratio * yx, ratio * xx - less
-        terms = np.stack([*squares, yh - ratio * my, xh - ratio * mx, less], axis=-1)
-        total += weight[..., np.newaxis] * terms
+        total += weight[..., np.newaxis] * np.stack([*squares, *steps, less], axis=-1)
     total = np.moveaxis(images.blurred(total, WINDOW), 2, 0)
     tensor, gradient, less = total[:3], total[3:5], total[5]
     # With noise N in the slopes, var = (A + N) / A^2: as if the information were A^2 / (A + N).
