@@ -113,15 +113,15 @@ def materials(
             wider = pool.estimate(image, inputs.labels[places], survey, noise)
             variance = image.expand(_between_windows(image, survey, noise, shape))
             between = np.where(np.isfinite(variance), variance, between)
+            # What differs between windows has the noise in it.
+            wider = replace(wider, inverse_energy=np.maximum(wider.inverse_energy, between))
             sharp = wider if sharp is None else sharp
             material = wider if material is None else _blurred(sharp, material, wider, noise)
     if material is None:
         return None
     # A pixel's own ratio is that of bands blurred differently: it does not make this more certain.
-    # The variance is that between windows of the image, and what the blurs have changed.
-    variance = material.inverse_energy + material.spread + between
-    none = np.zeros_like(variance)
-    material = replace(material, inverse_energy=variance, spread=none)
+    variance = material.inverse_energy + material.spread
+    material = replace(material, inverse_energy=variance, spread=np.zeros_like(variance))
     return pooled(inputs, stated=material)
 
 
