@@ -27,12 +27,16 @@ SHIFTS = [*(pytest.param(one, marks=pytest.mark.slow) for one in ((0.0, 0.0), (2
 
 
 def drawn(
-    seed: int, shift: tuple[float, float], picture: Picture | None = None, frames: int = 300
+    seed: int,
+    shift: tuple[float, float],
+    picture: Picture | None = None,
+    frames: int = 300,
+    emissivity: xr.DataArray = GLASS,
 ) -> tuple[xr.Dataset, np.ndarray]:
-    """Capture of people mirrored in glass, and the true shift (2, y, x) [pixel]."""
+    """Capture of people mirrored, by default in glass, and the true shift (2, y, x) [pixel]."""
     picture, rng = picture or Picture(), np.random.default_rng(seed)
     true = smooth_shift(picture.shape, *shift)
-    scene = picture.draw(np.arange(frames) / 10.0, GLASS, rng, true)
+    scene = picture.draw(np.arange(frames) / 10.0, emissivity, rng, true)
     return simulation.observe(scene, RESPONSE, rng), true
 
 
@@ -63,6 +67,20 @@ def test_finds_a_smooth_field() -> None:
     field = check(capture, true, 0.8, 0.03)
     assert field.attrs["reference_band"] == "8-14"
     assert field.attrs["bands"] == ["9.5"]
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_borders_of_materials_do_not_bend_the_field(seed: int) -> None:
+    """A blur moves a reflection at a border of materials, by half a pixel between unlike ones."""
+    squares = np.add.outer(np.arange(48) // 12, np.arange(64) // 16) % 2
+    of_pixel = np.array([[0.86, 0.6], [0.72, 0.7]])[:, squares]
+    tiles = xr.DataArray(of_pixel, {"band": GLASS["band"]}, ("band", "y", "x"))
+    picture = Picture(shape=squares.shape, walkers=7)
+    capture, true = drawn(seed, (2.4, 1.2), picture, 200, tiles)
+    error, _ = errors(alignment.reflection_shift(capture, RESPONSE), true)
+    off = np.sqrt(np.mean(error[1] ** 2))
+    print(f"{off:.4f} pixel off")
+    assert off < 0.04
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
