@@ -165,7 +165,8 @@ def _information(movies: Movies, shift: Array) -> Information:
         variance = level**2 + (ratio * movies.noise[0]) ** 2
         white, along = variance * _VALUE_NOISE**2, mh - ratio * mm
         # Before a lamp a step of the shift looks like another ratio: there a window has one.
-        uneven = 0.0 if movies.lamp else np.maximum(window(along**2) - white * window(mm), 0.0)
+        free = 0.0 if movies.lamp else 1.0
+        uneven = free * np.maximum(window(along**2) - white * window(mm), 0.0)
         uneven /= np.maximum(window(mm**2), np.finfo(np.float64).tiny)
         share = uneven / (white + uneven * mm)
         residual = window(hh - 2.0 * ratio * mh + ratio**2 * mm - share * along**2)
@@ -173,7 +174,7 @@ def _information(movies: Movies, shift: Array) -> Information:
         misfit = np.maximum(1.0 + excess / (number * movies.outside), 1.0)
         weight = used * ratio / (misfit * variance)
         yy, yx, xx = yy - share * my**2, yx - share * my * mx, xx - share * mx**2
-        moved = BLUR**2 * np.stack(np.gradient(ratio + share * along))
+        moved = free * BLUR**2 * np.stack(np.gradient(ratio + share * along))
         steps = (
             yh - ratio * my - share * my * along - yy * moved[0] - yx * moved[1],
             xh - ratio * mx - share * mx * along - yx * moved[0] - xx * moved[1],
