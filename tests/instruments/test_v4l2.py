@@ -223,6 +223,8 @@ def test_unplugging_is_told_and_close_still_works() -> None:
         capture.close()
     assert driver.files == set()
     assert all(memory.closed for memory in driver.maps)
+    with pytest.raises(SourceLostError, match="it is closed"):
+        capture.read()
 
 
 def test_buffer_goes_back_whatever_happens(monkeypatch: pytest.MonkeyPatch) -> None:
