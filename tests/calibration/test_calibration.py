@@ -70,18 +70,6 @@ def test_response_is_a_stage(two_bands: xr.Dataset) -> None:
         assert float(two_bands["noise"].sel(band=name)) == noise
 
 
-def test_line_is_polyfit() -> None:
-    """The linear pair is numpy's least-squares line over all temperatures."""
-    counts = blackbody()
-    fitted = calibration.fit_response(counts)
-    for name in ("8-14", "9.5"):
-        chosen = counts.sel(band=name)
-        slope, intercept = np.polyfit(chosen["temperature"] - 300.0, chosen, 1)
-        here = fitted.sel(band=name)
-        assert float(here["linear_slope"]) == pytest.approx(slope, abs=1e-8)
-        assert float(here["linear_intercept"]) == pytest.approx(intercept - 300 * slope, abs=1e-5)
-
-
 def test_linear_response_misreads() -> None:
     """A response linearised over 20-30 C reads 50 C as 52.8 C (8-14) and as 53.2 C (9.5)."""
     fitted = calibration.fit_response(blackbody(31).sel(temperature=slice(293.0, 303.3)))
@@ -92,13 +80,15 @@ def test_linear_response_misreads() -> None:
 
 
 def test_residuals(two_bands: xr.Dataset) -> None:
-    """A residual is measured less fitted counts; a least-squares fit leaves a sum of zero."""
+    """A residual is measured less fitted counts; least squares leave no sum and no slope."""
     temperature = two_bands["temperature"].values
     for kind, name in (("exact", "residual"), ("linear", "linear_residual")):
         found = two_bands[name].sel(band="9.5")
         fitted = response.curve(two_bands, "9.5", kind).counts(temperature)
         np.testing.assert_allclose(found, planck_counts("9.5", temperature) - fitted, atol=1e-9)
         assert float(found.sum()) == pytest.approx(0.0, abs=1e-8)
+        moment = float(found.values @ (temperature - 300.0))
+        assert kind == "exact" or moment == pytest.approx(0.0, abs=1e-5)
     assert float(abs(two_bands["linear_residual"]).max()) > 10.0  # the line does not fit
 
 
@@ -151,10 +141,7 @@ test_bad_counts = refused(
         (lambda it: it.isel(band=[0, 0]), "Repeated band"),
         (lambda it: it.drop_vars("temperature"), "Missing coordinate 'temperature'"),
         (lambda it: at(it, -20.0, 40.0), "Invalid temperature [K] -20.0"),
-        (
-            lambda it: at(it, 10.0, 70.0),
-            "temperature 10.0 K of a blackbody. Must be at least 100.0 K",
-        ),
+        (lambda it: at(it, 10, 70), "temperature 10.0 K of a blackbody. Must be at least 100.0 K"),
         (lambda it: it.values, "Invalid blackbody counts of type ndarray"),
     ],
 )

@@ -142,13 +142,6 @@ def test_other_bands_follow_the_kin() -> None:
     assert float(glass[0]) == pytest.approx(1 - 0.05 * (1 - 0.7180) / (1 - 0.8605), abs=1e-9)
 
 
-def test_contact_error_is_corrected_by_its_middle() -> None:
-    """A thermocouple that misses 2 to 4 % of 40 K reads 1.2 K low."""
-    bias = Bias(contact=(0.02, 0.04), air_temperature=295.0)
-    found = bias.corrected(np.array([335.0 - 0.03 * 40.0]))
-    np.testing.assert_allclose(found, 335.0, rtol=0, atol=1e-9)  # K
-
-
 def test_common_errors_do_not_average_out(known: xr.Dataset) -> None:
     """Sixteen times the measurements: a deviation of noise falls by 4, one of a bias stays."""
 

@@ -14,9 +14,7 @@ from dbthermal.correction import blackbody_statistics, correct_capture, fit_corr
 from dbthermal.schema import Status
 
 Array = np.ndarray[Any, np.dtype[Any]]
-Frames = dict[int, set[int]]
 BANDS, SHAPE, TIME = ["8-14", "9.5"], (30, 40), np.arange(240) / 10.0
-SLOPE, NOISE = np.array([120.0, 30.0]), np.array([0.03, 0.35])  # [count/K], [K]
 GLASS, PAINT = (0.86, 0.72), (0.93, 0.82)
 ROWS, COLUMNS = np.indices(SHAPE)
 SEEN = range(100, 106)
@@ -205,22 +203,6 @@ def test_distinct_frames_of_a_faster_stream_are_kept(times: tuple[int, int], lat
         counts = result["counts"].values[band, frames]
         np.testing.assert_allclose(counts, gain * film + offset, rtol=0, atol=0.1)  # [count]
     assert max(map(len, lost)) <= 2
-
-
-def test_noise_of_a_repeated_blackbody() -> None:
-    """Copies make the noise of a sweep neither smaller nor larger."""
-    rng = np.random.default_rng(1)
-    level = np.array([18000.0, 24000.0]).reshape(1, 2, 1, 1, 1)
-    counts = np.rint(level + rng.normal(0.0, 4.0, (1, 2, 20, 16, 16)))
-    dims = ("band", "temperature", "frame", "y", "x")
-    movies = xr.Dataset(
-        {"counts": (dims, counts.astype(np.uint16))},
-        {"band": ["8-14"], "temperature": [293.15, 333.15]},
-    )
-    statistics = blackbody_statistics(movies)
-    copied = blackbody_statistics(movies.isel(frame=np.repeat(np.arange(20), 3)))
-    np.testing.assert_allclose(copied["noise"], statistics["noise"], rtol=0, atol=1e-9)
-    assert copied.attrs["frames"] == statistics.attrs["frames"] == 20
 
 
 def holds(result: xr.Dataset, truth: xr.Dataset) -> float:

@@ -123,18 +123,13 @@ def test_provenance_of_every_step(recorded: Recorded) -> None:
     assert not steps & plain.attrs.keys()
 
 
-def flagged(raw: xr.Dataset, band: int, frames: slice) -> xr.Dataset:
-    """Raw capture with recorded flags, and a closed shutter in some frames of a band."""
-    flags = np.zeros(raw["counts"].shape[:2], dtype=np.uint16)
-    flags[band, frames] = 8
-    attrs = {"flag_masks": [4, 8], "flag_meanings": "foreign_clock shutter_closed"}
-    return raw.assign(frame_flags=(("band", "time"), flags, attrs))
-
-
 @pytest.mark.filterwarnings("ignore:Fixed pattern")
 def test_recorded_flags_tell_the_shutter(recorded: Recorded) -> None:
     """Frames with the recorded flag of a closed shutter are left out though their images differ."""
-    raw = flagged(recorded.raw.isel(time=slice(100)), 1, slice(40, 45))
+    flags = np.zeros((2, 100), dtype=np.uint16)
+    flags[1, 40:45] = 8
+    attrs = {"flag_masks": [4, 8], "flag_meanings": "foreign_clock shutter_closed"}
+    raw = recorded.raw.isel(time=slice(100)).assign(frame_flags=(("band", "time"), flags, attrs))
     corrected = correct_capture(raw, recorded.correction)
     lost = corrected["counts"].isnull().all(("y", "x")).values
     assert np.flatnonzero(lost[1]).tolist() == [40, 41, 42, 43, 44]

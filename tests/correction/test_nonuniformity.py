@@ -300,6 +300,14 @@ def test_drift_is_no_noise(movies: xr.Dataset) -> None:
     assert float(noise[1]) == pytest.approx(60.0, rel=0.04)
 
 
+def test_noise_of_a_repeated_blackbody(movies: xr.Dataset) -> None:
+    """Copies make the noise of a sweep neither smaller nor larger."""
+    statistics = blackbody_statistics(movies)
+    copied = blackbody_statistics(movies.isel(frame=np.repeat(np.arange(12), 3)))
+    np.testing.assert_allclose(copied["noise"], statistics["noise"], rtol=0, atol=1e-9)
+    assert copied.attrs["frames"] == statistics.attrs["frames"] == 12
+
+
 test_movies_must_vary = refused(
     lambda movies, change: blackbody_statistics(change(movies)),
     [

@@ -274,10 +274,7 @@ def test_region_is_dragged_and_its_curve_read_back(lab: Lab, page: Any) -> None:
     slider.focus()
     for key in ("ArrowRight", "ArrowRight", "ArrowLeft", "Shift+ArrowRight"):
         page.keyboard.press(key)
-    page.wait_for_function(
-        "index => document.querySelector('[data-testid=explorer]').explorer.drawn === index",
-        arg=start + 11,
-    )
+    page.wait_for_function(f"{EXPLORER}.drawn === {start + 11}")
     assert int(slider.input_value()) == start + 11
     frame = view.frame("object_temperature", start + 11)
     level = float(np.nanmedian(frame))

@@ -58,11 +58,6 @@ def bench() -> BosonBench:
     return BosonBench()
 
 
-def camera_of(line: Dialogue, first_sequence: int = 1) -> Boson:
-    """Driver that takes part in a dialogue."""
-    return Boson(line, first_sequence=first_sequence)
-
-
 def test_commands_are_the_published_ones() -> None:
     """Readings, settings, states and errors have their published numbers, none of them twice."""
     modes = {name: (command + 1, ">i") for name, (command, _) in SETTINGS.items()}
@@ -93,7 +88,7 @@ def test_every_setting_is_kept(bench: BosonBench, name: str) -> None:
         bench.camera.set(setting, value)
         assert bench.camera.read(setting) is value
         with Dialogue([(request(1, command, struct.pack(">i", value)), reply(1, command))]) as line:
-            camera_of(line).set(setting, value)
+            Boson(line, first_sequence=1).set(setting, value)
     bench.state.serial_number = 0x8E9EAE81  # its bytes need escapes
     values = {reading.name: bench.camera.read(reading) for reading in FOUND.values()}
     assert (values["serial number"], values["part number"]) == (0x8E9EAE81, "EMULATED-BOSON-640")
@@ -101,7 +96,7 @@ def test_every_setting_is_kept(bench: BosonBench, name: str) -> None:
     choices = f"0 .{kind(0).name}., 1 .{kind(1).name}."
     wrong: Any = -1
     with pytest.raises(ValueError, match=rf"Invalid {setting.name} -1\. Must be one of {choices}"):
-        camera_of(Dialogue([])).set(setting, wrong)
+        Boson(Dialogue([]), first_sequence=1).set(setting, wrong)
 
 
 PIECES = [ESCAPED_REPLY[:17], ESCAPED_REPLY[17:18], ESCAPED_REPLY[18:]]
@@ -130,7 +125,7 @@ def test_dialogues_that_give_a_value(
     """Public bytes are sent and understood, and what is no reply to the request is discarded."""
     first = int(pairs[0][0] != request(0, FPA))
     with Dialogue(pairs) as line:
-        assert camera_of(line, first).read(reading) == pytest.approx(value, abs=1e-9)
+        assert Boson(line, first_sequence=first).read(reading) == pytest.approx(value, abs=1e-9)
 
 
 # What asks for the exchange of a command.
@@ -163,7 +158,7 @@ def test_exchanges_that_fail(
     """A mute camera is asked three times, but set once; other replies are errors that say why."""
     pairs = [(request(1, command), answer)] if isinstance(answer, bytes) else answer
     with Dialogue(pairs) as line, pytest.raises(error, match=message):
-        ASKED[command](camera_of(line))
+        ASKED[command](Boson(line, first_sequence=1))
 
 
 blobs = st.lists(st.binary(max_size=60), max_size=6)
@@ -172,7 +167,7 @@ blobs = st.lists(st.binary(max_size=60), max_size=6)
 @given(blobs)
 def test_any_answer_is_a_value_or_a_documented_error(pieces: list[bytes]) -> None:
     """Any bytes give a number or a documented error; the emulator answers on after any bytes."""
-    camera = camera_of(Dialogue([(SERIAL_REQUEST, pieces)]))
+    camera = Boson(Dialogue([(SERIAL_REQUEST, pieces)]), first_sequence=1)
     with suppress(BosonError):
         assert 0 <= camera.read(boson.SERIAL_NUMBER, repeats=0) < 2**32
     bench = BosonBench()
@@ -223,7 +218,7 @@ def test_a_correction_that_is_slow_to_start_is_waited_for() -> None:
         for number, (command, data) in enumerate(requests, start=1)
     ]
     with Dialogue(pairs) as line:
-        assert camera_of(line).run_ffc() == 1234
+        assert Boson(line, first_sequence=1).run_ffc() == 1234
 
 
 @pytest.mark.parametrize("answers", [99, 3])

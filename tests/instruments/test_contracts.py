@@ -11,14 +11,13 @@ import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 from faulty_camera import frames, two_cameras
 from faulty_devices import FILTERS, QUICK, BosonBench, LoggerBench, connected
-from test_v4l2 import BYTES, GOOD, STREAM, Driver
+from test_v4l2 import BYTES, GOOD, STREAM, Driver, session
 
 from dbthermal.instruments import boson, filterwheel, inventory, v4l2
 from dbthermal.instruments import camera as interface
@@ -27,7 +26,6 @@ from dbthermal.instruments.devices import open_devices
 from dbthermal.instruments.emulated import World
 from dbthermal.instruments.emulated.devices import EmulatedApt
 from dbthermal.instruments.filterwheel import FilterWheel
-from dbthermal.instruments.session import Session
 from dbthermal.instruments.tc08 import TC08
 from dbthermal.instruments.transport import TransportError, open_serial
 
@@ -97,9 +95,8 @@ def emulated_video(_: ExitStack) -> Opened:
 
 def y16_video(stack: ExitStack) -> Opened:
     """The emulated Y16 camera of a session, as `open_devices` opens it."""
-    file = Path(__file__).parents[2] / "params" / "sessions" / "y16.yaml"
-    session = Session.load(file, {"shape": [4, 6], "frame_rate": 60})
-    return Opened(stack.enter_context(open_devices(session)).sources["8-14"], True)
+    devices = stack.enter_context(open_devices(session(shape=[4, 6], frame_rate=60)))
+    return Opened(devices.sources["8-14"], True)
 
 
 def real_video(stack: ExitStack) -> Opened:

@@ -196,8 +196,7 @@ def test_arbitrary_answers(answers: list[bytes]) -> None:
         connected(Babbler([(None, [bytes(256)] * 513)]))
 
 
-Case = tuple[dict[str, Any], type[WheelError], str]
-REFUSED: list[Case] = [
+REFUSED: list[tuple[dict[str, Any], type[WheelError], str]] = [
     ({"deaf_to": "MOT_SET_VELPARAMS"}, WheelError, "velocity 0. Must be 21987328"),
     ({"deaf_to": "MOT_SET_HOMEPARAMS"}, WheelError, "home velocity 0. Must be 4397466"),
     ({"deaf_to": "MOD_SET_CHANENABLESTATE"}, WheelError, "did not enable the motor"),

@@ -185,10 +185,9 @@ def test_damage_is_told(used: int, flags: int, expected: FrameFlag) -> None:
     assert np.count_nonzero(frame.counts) == min(used // 2, 24)
 
 
-@pytest.mark.parametrize("answers", [[], [(-1, 0, 0, 0)]])
-def test_no_frame_in_time(answers: list[tuple[int, int, int, int]]) -> None:
-    """A wait without a frame, and an announced frame that is missing, are no lost frames."""
-    driver = Driver(answers=answers)
+def test_no_frame_in_time() -> None:
+    """An announced frame that is missing is no lost frame."""
+    driver = Driver(answers=[(-1, 0, 0, 0)])
     with opened(driver) as capture:
         with pytest.raises(NoFrameError, match="No frame from '/dev/video0'"):
             capture.read(0.1)

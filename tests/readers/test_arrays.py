@@ -70,9 +70,6 @@ def test_times_of_npz_and_arrays_of_other_libraries(tmp_path: Path) -> None:
         read(hdf5(tmp_path / "b.h5", _long_name="Temperature in 0.01 K"))
     with pytest.raises(ValueError, match=r"frames \(1, 3, 24, 32\)\. .* squeeze axes"):
         read(hdf5(tmp_path / "b.h5", scene()[np.newaxis]))
-    savemat(tmp_path / "struct.mat", {"camera": {"frames": scene()}})
-    with pytest.raises(ValueError, match=r"none outside structs, cells.*save bands, fields"):
-        read(tmp_path / "struct.mat")
 
 
 def test_a_store_of_our_own_is_no_camera(tmp_path: Path) -> None:
@@ -382,9 +379,6 @@ def test_zarr_runs_no_code_and_fills_nothing_in(tmp_path: Path) -> None:
     (path / "frames" / ".zarray").write_text(json.dumps(about))
     with pytest.raises(ValueError, match=r"Damaged 'b\.zarr': .*pickle"):
         read(path)
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(ValueError, match=r"Invalid folder '.*empty', no whole zarr"):
-        read(tmp_path / "empty")
 
 
 @pytest.mark.parametrize("form", [2, 3])
@@ -532,7 +526,7 @@ def test_matlab_5(tmp_path: Path, *, packed: bool) -> None:
     for wrong, rule in (
         ({"frames": film.astype(float)}, "Invalid dtype float64"),
         ({"frames": film, "more": film}, "Missing name of one of the arrays"),
-        ({"settings": {"frames": film}}, "Missing array"),
+        ({"settings": {"frames": film}}, r"none outside structs, cells.*save bands, fields"),
     ):
         savemat(path, wrong, do_compression=packed)
         with pytest.raises(ValueError, match=rule):

@@ -323,13 +323,10 @@ def test_parts_of_a_recording(path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "content", "rule"),
     [
-        ("a.ravi", b"", r"Refused 'a\.ravi': export its counts as 16-bit TIFF"),
-        ("a.irb", b"", "readers.tiff"),
         ("a.ats", b"", "readers.tiff"),
         ("a.mp4", b"\0\0\0\x18ftypmp42", "film: most have 8 bits that are drawn.*gray16le"),
         ("a.seq", b"BM" * 40, "picture: most have 8 bits"),
         ("a.mat", b"MATLAB 5.0 MAT-file", r"by its first bytes\. Must be read by readers\.array"),
-        ("a.hdf", b"\x0e\x03\x13\x01", "HDF4: convert it"),
         ("a.seq", b"II*\0" * 9, r"by its first bytes\. Must be read by readers\.tiff"),
         ("a.seq", b"", "Empty file"),
         ("a.seq", sequence(scene(1) // np.uint16(256)), "they have 8 bits, alone or spread"),

@@ -73,7 +73,11 @@ def test_foreign_formats_are_named(tmp_path: Path) -> None:
             stated: Any = {} if read is readers.flir else options
             with pytest.raises(ValueError, match=rf"Refused 'a\.dat', a {expected}"):
                 read(path, **stated)
-    ways = {"ravi": "export its counts", "irb": "export its counts", "xlsx": "a table: export 16"}
+    ways = {
+        "ravi": "export its counts as 16-bit TIFF",
+        "irb": "export its counts",
+        "xlsx": "a table: export 16",
+    }
     for suffix, way in ways.items():
         (tmp_path / f"a.{suffix}").write_bytes(b"something else")
         with pytest.raises(ValueError, match=rf"Refused 'a\.{suffix}': {way}"):

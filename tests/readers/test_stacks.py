@@ -29,15 +29,22 @@ FORMS: dict[str, dict[str, Any]] = {
 }
 
 
-HALVES = f"{0.5 * scene()[0].min():g} to {0.5 * scene()[0].max():g}"
-
-
+HALF = 0.5 * scene().astype("f4")
+HALVES = f"{HALF[0].min():g} to {HALF[0].max():g}"
 GDAL = '<GDALMetadata>\n<Item name="{}" sample="0" role="{}">{}</Item>\n</GDALMetadata>'
 
 
 def write(path: Path, counts: Any, **options: Any) -> None:
     """TIFF of gray values, unless it is to have colours."""
     tifffile.imwrite(path, counts, **{"photometric": "minisblack", **options})
+
+
+def one_a_frame(folder: Path, *names: str) -> list[Path]:
+    """Files of one frame each."""
+    paths = [folder / f"{name}.tif" for name in names]
+    for path, image in zip(paths, scene(len(paths)), strict=True):
+        write(path, image)
+    return paths
 
 
 def read(path: Path | list[Path], clock: float | None = 10.0) -> xr.Dataset:
@@ -64,9 +71,7 @@ def test_frames_appended_one_by_one(tmp_path: Path) -> None:
 
 def test_one_file_a_frame(tmp_path: Path) -> None:
     """Files in the order of time; an order of text is noticed."""
-    paths = [tmp_path / f"frame{number}.tif" for number in (8, 9, 10)]
-    for path, image in zip(paths, scene(), strict=True):
-        write(path, image)
+    paths = one_a_frame(tmp_path, "frame8", "frame9", "frame10")
     assert_array_equal(read(paths).counts, scene())
     with pytest.raises(ValueError, match=r"numbers of 'frame8\.tif' do not rise"):
         read(sorted(paths))
@@ -79,17 +84,30 @@ def test_one_file_a_frame(tmp_path: Path) -> None:
         read(paths)
 
 
-def test_numbers_that_are_left_out_are_gaps_in_time(tmp_path: Path) -> None:
-    """Frames of one file each that are missing by their numbers leave a gap, with a warning."""
-    names = [f"run2_{number}" for number in (10, 12, 14, 20, 22)]
-    paths = [tmp_path / f"{name}.tif" for name in names]
-    for path, image in zip(paths, scene(5), strict=True):
-        write(path, image)
-    with pytest.warns(UserWarning, match=r"'run2_10.tif to run2_22.tif' leave out 2 frames"):
+JITTER = (57.0, 57.102, 57.199, 57.601, 57.7)  # of dates in names [s]
+
+
+@pytest.mark.parametrize(
+    ("names", "places"),
+    [
+        ([f"run2_{number}" for number in (10, 12, 14, 20, 22)], [0, 1, 2, 5, 6]),
+        ([f"a_20241027_1559{second:06.3f}" for second in JITTER], [0, 1, 2, 6, 7]),
+        ([f"2024-10-27T15.59.{second:06.3f}" for second in JITTER], [0, 1, 2, 6, 7]),
+        ([f"17300400{second:06.3f}" for second in JITTER], [0, 1, 2, 6, 7]),
+        ([f"a17300400{1e3 * second:05.0f}" for second in JITTER], [0, 1, 2, 6, 7]),
+    ],
+)
+def test_what_names_leave_out_is_a_gap_in_time(
+    tmp_path: Path, names: list[str], places: list[int]
+) -> None:
+    """By numbers, of which every second may be there, dates, or seconds since 1970: warned of."""
+    paths, missing = one_a_frame(tmp_path, *names), places[-1] - 4
+    expected = f"'{names[0]}.tif to {names[-1]}.tif' leave out {missing} frames"
+    with pytest.warns(UserWarning, match=expected):
         made = read(paths)
-    assert_allclose(made["exposure_time"], [0.0, 0.1, 0.2, 0.5, 0.6], atol=1e-9)  # [s]
+    assert_allclose(made["exposure_time"], np.array(places) / 10.0, atol=1e-9)  # [s]
     assert_array_equal(made["frame_flags"] > 0, [False, False, False, True, False])
-    assert_allclose(read(paths[:3])["exposure_time"], [0.0, 0.1, 0.2])  # every second one
+    assert_allclose(read(paths[:3])["exposure_time"], [0.0, 0.1, 0.2])
 
 
 def test_a_stack_that_is_left_out_is_a_gap_in_time(tmp_path: Path) -> None:
@@ -107,27 +125,6 @@ def test_a_stack_that_is_left_out_is_a_gap_in_time(tmp_path: Path) -> None:
         read(tmp_path / "two.tif")
 
 
-@pytest.mark.parametrize(
-    "form",
-    [
-        "a_20241027_1559{:06.3f}",
-        "2024-10-27T15.59.{:06.3f}",
-        "17300400{:06.3f}",
-        "a17300400{:05.0f}",
-    ],
-)
-def test_dates_in_names_are_gaps_in_time(tmp_path: Path, form: str) -> None:
-    """So are dates, and seconds since 1970, which jitter; a counter behind a date is none."""
-    scale = 1e3 if form.endswith(":05.0f}") else 1.0
-    seconds = [57.0, 57.102, 57.199, 57.601, 57.7]
-    paths = [tmp_path / f"{form.format(scale * second)}.tif" for second in seconds]
-    for path, image in zip(paths, scene(5), strict=True):
-        write(path, image)
-    with pytest.warns(UserWarning, match="leave out 3 frames"):
-        made = read(paths)
-    assert_allclose(made["exposure_time"], [0.0, 0.1, 0.2, 0.6, 0.7], atol=1e-9)  # [s]
-
-
 @pytest.mark.parametrize("fraction", ["", "_{:03}", ".{:03}"])
 def test_dates_in_names_that_jump(tmp_path: Path, fraction: str) -> None:
     """In autumn the local hour comes twice: sorted by names, frames are in another order."""
@@ -138,18 +135,16 @@ def test_dates_in_names_that_jump(tmp_path: Path, fraction: str) -> None:
         names.append(
             f"a_20261025_{hour}{second + 50 * (number < 10):02}{fraction.format(200 * part)}"
         )
-    for name, image in zip(names, scene(20), strict=True):
-        write(tmp_path / f"{name}.tif", image)
+    paths = one_a_frame(tmp_path, *names)
     with pytest.warns(UserWarning, match=r"leave out \d{4,5} frames, the first before frame 10\."):
-        made = read([tmp_path / f"{name}.tif" for name in sorted(names)], clock=clock)
+        made = read(sorted(paths), clock=clock)
     assert made["time"].values[-1] > 3500.0  # [s]
 
 
 def test_dates_in_names_contradict_the_clock(tmp_path: Path) -> None:
     """Dates whose rate is not that of the clock are a warning, as of a wrong frame rate."""
-    paths = [tmp_path / f"a_20241027_1559{second:06.3f}.tif" for second in np.arange(57, 59, 0.1)]
-    for path, image in zip(paths, scene(20), strict=True):
-        write(path, image)
+    names = [f"a_20241027_1559{second:06.3f}" for second in np.arange(57, 59, 0.1)]
+    paths = one_a_frame(tmp_path, *names)
     read(paths)
     with pytest.warns(UserWarning, match=r"dates of 'a_.* are 0\.1 s apart, by clock= 0\.2 s"):
         made = read(paths, clock=5.0)
@@ -162,9 +157,7 @@ def test_names_without_gaps(tmp_path: Path) -> None:
     counted = [f"20241027_155958_{number:03}" for number in (7, 8, 9)] + ["20241027_155959_010"]
     odd = [f"20249999_15595{second}_{second}" for second in range(4)]
     for names, clock in ((whole, 1.0), (counted, 10.0), (odd, 10.0)):
-        paths = [tmp_path / f"{name}.tif" for name in names]
-        for path, image in zip(paths, scene(4), strict=True):
-            write(path, image)
+        paths = one_a_frame(tmp_path, *names)
         assert_allclose(read(paths, clock=clock)["exposure_time"] * clock, range(4))
     write(paths[2], scene()[1])
     with pytest.warns(UserWarning, match=r"Same counts in '.*_1\.tif' and '.*_2\.tif', 1 in all"):
@@ -222,12 +215,10 @@ def test_png_of_16_bits(tmp_path: Path) -> None:
     assert found.attrs["format"] == "PNG"
     with pytest.raises(ValueError, match=r"Invalid 'a0.tif' .* read by readers\.tiff"):
         readers.flir(paths[0])
+    gray = scene()[0]
     for counts, message in (
-        (
-            scene()[0].astype("u1"),
-            "24 x 32 pixels of 8 bits, .* Must be of 16 bits and gray: counts",
-        ),
-        (np.stack([scene()[0]] * 3, axis=-1), "colours 2, .*Must be of 16 bits and gray"),
+        (gray.astype("u1"), "24 x 32 pixels of 8 bits, .* Must be of 16 bits and gray: counts"),
+        (np.stack([gray] * 3, axis=-1), "colours 2, .*Must be of 16 bits and gray"),
     ):
         with pytest.raises(ValueError, match=message):
             read(picture(tmp_path / "b.png", counts))
@@ -275,8 +266,10 @@ def test_frame_rate_of_a_description(tmp_path: Path) -> None:
             assert_array_equal(read(path).counts, scene())
 
 
+FILM = scene()
 FOUR = scene(4).reshape(2, 2, 24, 32)
 BANDS: dict[str, Any] = {"imagej": True, "metadata": {"axes": "TCYX"}, "photometric": None}
+OME = {"ome": True, "metadata": {"axes": "CTYX"}}
 SCALED = {"imagej": True, "metadata": {"axes": "TYX", "c0": -273.15, "c1": 0.04}}
 SCALE, OFFSET = GDAL.format("SCALE", "scale", 0.01), GDAL.format("OFFSET", "offset", 9)
 
@@ -289,55 +282,35 @@ def tagged(code: int, kind: int, value: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("counts", "options", "message"),
     [
-        (scene(), {"compression": "jpeg2000"}, "Invalid compression .* one without loss: LZW, de"),
-        (
-            0.5 * scene().astype("f4"),
-            {},
-            f"Invalid TIFF 'a.tif': .* of page 0, float32 from {HALVES}",
-        ),
-        (scene().astype("f2") / 9, {}, "Invalid values of page 0, float16 from"),
-        (scene().astype("i2"), {}, "Invalid sample format 2 of page 0"),
-        (scene().astype("u1"), {}, "Invalid bits of a pixel 8 of page 0"),
+        (FILM, {"compression": "jpeg2000"}, "Invalid compression .* one without loss: LZW, de"),
+        (HALF, {}, f"Invalid TIFF 'a.tif': .* of page 0, float32 from {HALVES}"),
+        (FILM.astype("f2") / 9, {}, "Invalid values of page 0, float16 from"),
+        (FILM.astype("i2"), {}, "Invalid sample format 2 of page 0"),
+        (FILM.astype("u1"), {}, "Invalid bits of a pixel 8 of page 0"),
         (scene(3), {"photometric": "rgb", "planarconfig": "separate"}, "values of a pixel 3"),
         (scene(1)[0], {"tile": (1024, 1024)}, "Invalid 1 tiles of 1024 x 1024 of page 0. Must"),
         (scene(1)[0], {"subfiletype": 1}, "Invalid preview True of page 0"),
-        (scene() // np.uint16(256), {}, "they have 8 bits, alone or spread over two bytes"),
-        (scene() // np.uint16(256) * np.uint16(257), {}, "they have 8 bits"),
-        (0 * scene(), {}, "Invalid counts of 'a.tif': all are 0. Must be 16-bit counts"),
-        (scene() // np.uint16(256) * np.uint16(256) + np.uint16(9), {}, "they have 8 bits"),
+        (FILM // np.uint16(256), {}, "they have 8 bits, alone or spread over two bytes"),
+        (FILM // np.uint16(256) * np.uint16(257), {}, "they have 8 bits"),
+        (0 * FILM, {}, "Invalid counts of 'a.tif': all are 0. Must be 16-bit counts"),
+        (FILM // np.uint16(256) * np.uint16(256) + np.uint16(9), {}, "they have 8 bits"),
         (FOUR, {}, r"Invalid axes YX of \[2, 2\] images. Must be TYX, time"),
         (FOUR, {"description": "my lab"}, r"Invalid axes YX of \[2, 2\] images"),
         (FOUR, BANDS, r"Invalid axes \w+ of \[2, 2\] images"),
-        (
-            FOUR,
-            {"ome": True, "metadata": {"axes": "CTYX"}},
-            r"Invalid axes \w+ of \[1, 2, 2\] images",
-        ),
+        (FOUR, OME, r"Invalid axes \w+ of \[1, 2, 2\] images"),
         *(
-            (
-                scene(),
-                {"metadata": {"axes": axes}},
-                f"Invalid axes {axes} .*Must be TYX, time, rows",
-            )
-            for axes in ("CYX", "XYT", "SYX", "TXY", "EYX")
+            (FILM, {"metadata": {"axes": it}}, f"Invalid axes {it} .*Must be TYX, time, rows")
+            for it in ("CYX", "XYT", "SYX", "TXY", "EYX")
         ),
-        (scene(), {"imagej": True}, "Invalid axes CYX of .* images"),
-        (scene(), SCALED, "Invalid c0 -273.15 of page 0, by GDAL or ImageJ. Must be 0: counts as"),
-        (scene().byteswap(), {}, "Invalid counts of 'a.tif': rougher than with bytes swapped"),
-        (scene(), {"ome": True}, "Invalid axes CYX of .* images"),
-        (scene(), {"photometric": "miniswhite"}, "Invalid photometric interpretation 0 of page 0"),
-        (
-            scene(),
-            tagged(274, 3, 6),
-            "Invalid orientation 6 of page 0. Must be 1: rows from the top",
-        ),
-        (scene(), tagged(42112, 2, SCALE), "Invalid scale 0.01 of page 0, by GDAL"),
-        (scene(), tagged(42112, 2, OFFSET), "Invalid offset 9 .*Must be 0"),
-        (
-            scene(),
-            tagged(42113, 2, str(scene()[1, 2, 3])),
-            "Missing counts in 'a.tif'.* Must all be",
-        ),
+        (FILM, {"imagej": True}, "Invalid axes CYX of .* images"),
+        (FILM, SCALED, "Invalid c0 -273.15 of page 0, by GDAL or ImageJ. Must be 0: counts as"),
+        (FILM.byteswap(), {}, "Invalid counts of 'a.tif': rougher than with bytes swapped"),
+        (FILM, {"ome": True}, "Invalid axes CYX of .* images"),
+        (FILM, {"photometric": "miniswhite"}, "Invalid photometric interpretation 0 of page 0"),
+        (FILM, tagged(274, 3, 6), "Invalid orientation 6 of page 0. Must be 1: rows from the top"),
+        (FILM, tagged(42112, 2, SCALE), "Invalid scale 0.01 of page 0, by GDAL"),
+        (FILM, tagged(42112, 2, OFFSET), "Invalid offset 9 .*Must be 0"),
+        (FILM, tagged(42113, 2, str(FILM[1, 2, 3])), "Missing counts in 'a.tif'.* Must all be"),
     ],
 )
 def test_refused(tmp_path: Path, counts: Any, options: dict[str, Any], message: str) -> None:

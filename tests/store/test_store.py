@@ -5,7 +5,7 @@ import math
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import av
 import numpy as np
@@ -194,21 +194,18 @@ def test_video_comes_back(tmp_path: Path, options: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("frames", "message"),
+    ("frames", "codec", "message"),
     [
-        (film((32, 47)), "Invalid frame of 32 x 47 pixels. Must be of even size"),
-        (film((32, 48), (32, 46)), "as all others: 32 x 48"),
-        ([], "Invalid film without frames"),
+        (film((32, 47)), "vp9", "Invalid frame of 32 x 47 pixels. Must be of even size"),
+        (film((32, 48), (32, 46)), "vp9", "as all others: 32 x 48"),
+        ([], "vp9", "Invalid film without frames"),
+        (film((32, 48)), "gif", r"Invalid codec 'gif'. Must be one of \['h264', 'vp9'"),
     ],
 )
-def test_no_video_of_nonsense(tmp_path: Path, frames: list[np.ndarray], message: str) -> None:
+def test_no_video_of_nonsense(tmp_path: Path, frames: Any, codec: Any, message: str) -> None:
     """Frames that cannot be a video raise a ValueError, and no file is left behind."""
     with pytest.raises(ValueError, match=message):
-        store.save_video(frames, tmp_path / "a.mp4", RECORD, rate=10.0)
-    with pytest.raises(ValueError, match=r"Invalid codec 'gif'. Must be one of \['h264', 'vp9'"):
-        store.save_video(
-            film((32, 48)), tmp_path / "c.mp4", RECORD, rate=10.0, codec=cast(Any, "gif")
-        )
+        store.save_video(frames, tmp_path / "a.mp4", RECORD, rate=10.0, codec=codec)
     assert not any(tmp_path.iterdir())
 
 
