@@ -307,9 +307,8 @@ def plan(options: Namespace) -> dict[str, Any]:
     """Command `plan`."""
     table = emissivity.embedded_table()
     if options.materials:
-        names = table["material"].values.tolist()
-        for name in (name for name in options.materials if name not in names):
-            raise ValueError(f"Unknown material '{name}'. Must be one of {names}.")
+        for name in options.materials:
+            check_listed("Unknown material", name, table["material"].values.tolist())
         table = table.sel(material=[*dict.fromkeys(options.materials)])
     level = {"level": SKY_LEVEL} if options.outdoors else {}
     design = limits.CaptureDesign(**accepted(limits.CaptureDesign, options), **level)

@@ -108,11 +108,6 @@ class Stream:
     frame_rate: float = 60.0  # [Hz]
     telemetry_rows: int = 0  # below the image: 2 for a Boson with telemetry on
 
-    @property
-    def rows(self) -> int:
-        """Rows of the whole frame."""
-        return self.shape[0] + self.telemetry_rows
-
 
 class FrameSource(Protocol):
     """An open camera that gives a sequence of frames."""

@@ -95,9 +95,10 @@ class Capture(Closing):
     def __init__(
         self, path: str, stream: Stream, kernel: Kernel | None = None, decode: Decode | None = None
     ) -> None:
-        self.path, self.stream, self._decode = path, stream, decode
+        self.path, self._decode = path, decode
         self.shape, self.frame_rate = stream.shape, stream.frame_rate
         self.telemetry_rows = stream.telemetry_rows
+        self._form = stream.shape[0] + stream.telemetry_rows, stream.shape[1]  # of a whole frame
         self._kernel = kernel or Kernel()
         self.clock = self._kernel.clock
         self._maps: list[Any] = []
@@ -197,7 +198,7 @@ class Capture(Closing):
     def _agree(self) -> None:
         """Set format and rate; a driver sets the nearest that it can, which is an error here."""
         # The format, with every row.
-        rows, columns = self.stream.rows, self.shape[1]
+        rows, columns = self._form
         line = _BYTES * columns
         wanted = columns, rows, Y16, _PROGRESSIVE, line, rows * line
         agreed = self._ask(S_FMT, FORMAT, _CAPTURE, *wanted, 0)[1:7]
@@ -218,7 +219,7 @@ class Capture(Closing):
         """Copy a frame out of its buffer and translate the kernel's flags."""
         index, _, used, state, _, seconds, micros, sequence, *_ = buffer
         # The image, with zeros in place of missing bytes.
-        image = np.zeros((self.stream.rows, self.shape[1]), dtype="<u2")
+        image = np.zeros(self._form, dtype="<u2")
         size = min(used, image.nbytes)
         image.reshape(-1).view(np.uint8)[:size] = np.frombuffer(self._maps[index], np.uint8, size)
         # The state of the frame and of its stamp.

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import schema, store
+from dbthermal._arrays import Mask
 from dbthermal.alignment import exposure_times, fill_times
 from dbthermal.correction import correct
 from dbthermal.instruments.camera import UNTIMED, FrameFlag
@@ -39,7 +39,6 @@ __all__ = [
 __dir__ = __all__.copy
 
 Place = tuple[slice, slice]
-Valid = npt.NDArray[np.bool_]
 
 # Attribute of a sweep, as of `calibration.fit_response`, by the key of the session's blackbody.
 _ACCURACY: Final = {
@@ -159,7 +158,7 @@ def overview(folder: str | Path) -> xr.Dataset:
     return table.set_coords(["recording", "band"])
 
 
-def _good(frames: xr.Dataset, bad: FrameFlag, stamp: str = "device_time") -> Valid:
+def _good(frames: xr.Dataset, bad: FrameFlag, stamp: str = "device_time") -> Mask:
     """True for the frames that have a stamp and none of the flags."""
     flags, stamps = frames["frame_flags"].values, frames[stamp].values
     return np.asarray(np.isfinite(stamps) & ((flags & int(bad)) == 0))

@@ -221,8 +221,7 @@ class _Run:
         self.over, self.done = threading.Event(), threading.Event()
         self.errors: list[BaseException] = []
         self.interrupted, self.ended = "", ""
-        # For the preview: totals and last frames that are written, and last readings.
-        self.totals: Totals = {}
+        # For the preview: last frames that are written, and last readings.
         self.last_frames: dict[str, camera.Frame] = {}
         self.last_readings: dict[str, float] = {}
         # Work for the writer: notes, and at most `limits.queue` frames of each band.
@@ -293,8 +292,9 @@ class _Run:
         while not self.clock.wait(self.done, period):
             if preview and self.last_frames and self._is_going():
                 period = max(_SHOW_POLL, self.limits.preview_period)
-                time, frames = self.clock() - self.start, dict(self.last_frames)
-                preview(Preview(time, frames, self.totals, dict(self.last_readings), self.units))
+                time, totals = self.clock() - self.start, self.file.totals
+                frames, readings = dict(self.last_frames), dict(self.last_readings)
+                preview(Preview(time, frames, totals, readings, self.units))
 
     def write(self) -> None:
         """Start the other threads, write frames and notes until the end, and close the file."""
@@ -338,7 +338,6 @@ class _Run:
         if band in self.last_frames or not early or has_device_clock:
             flags = self.file.frame(band, frame, refused)
             self.last_frames[band] = replace(frame, flags=flags)
-            self.totals = self.file.totals
         self._room[band].release()
         self._written += 1
         if self._written % self.limits.chunk == 0 and self._is_going():
