@@ -18,7 +18,7 @@ from scipy.constants import zero_Celsius
 from dbthermal.instruments import inventory, protocols
 from dbthermal.instruments.devices import Devices, open_devices
 from dbthermal.instruments.live import Watch
-from dbthermal.instruments.recording import Preview, SignalExit, Summary, raised_signals
+from dbthermal.instruments.recording import Preview, SignalExit, raised_signals
 from dbthermal.instruments.session import Session
 
 
@@ -65,22 +65,16 @@ def _run(session: Session, folder: Path, *, dry: bool) -> int:
         # The protocol of the session.
         _say("Preparing: cameras are set, offsets corrected, the wheel is homed and turned.")
         devices.prepare()
-        summaries = _record(devices, folder)
+        show = partial(_progress, Watch())
+        if session.blackbody is None:
+            summaries = [protocols.record_scene(devices, path, preview=show)]
+        else:
+            ask = partial(_set_blackbody, devices)
+            summaries = protocols.record_sweep(devices, folder, set_temperature=ask, preview=show)
+        _say("")
     for summary in summaries:
         _say(f"{summary.path}: {summary.ended}, {dict(summary.totals)}")
     return 0 if all(summary.ended == "duration" for summary in summaries) else 1
-
-
-def _record(devices: Devices, folder: Path) -> list[Summary]:
-    """Run the session's protocol."""
-    show, name = partial(_progress, Watch()), devices.session.name
-    if devices.session.blackbody is None:
-        summaries = [protocols.record_scene(devices, folder / f"{name}.zarr", preview=show)]
-    else:
-        ask = partial(_set_blackbody, devices)
-        summaries = protocols.record_sweep(devices, folder, set_temperature=ask, preview=show)
-    _say("")
-    return summaries
 
 
 def _progress(watch: Watch, preview: Preview) -> None:

@@ -3,6 +3,7 @@
 import base64
 import io
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
@@ -56,7 +57,7 @@ class Explorer(anywidget.AnyWidget):
     def __init__(self, view: View, *, celsius: bool = True) -> None:
         self.view = view
         self.regions: dict[str, Region] = {}
-        self._celsius, self._limits = celsius, dict[str, tuple[float, float]]()
+        self._celsius, self._range = celsius, cache(view.limits)  # range of colour of a pane
         self._state: dict[str, Any] = {"index": view.time.size // 2, "pixels": "unflagged"}
         super().__init__()
         self.on_msg(self._on_message)
@@ -85,12 +86,6 @@ class Explorer(anywidget.AnyWidget):
         buffer = io.BytesIO()
         _export.figure(view, shown).savefig(buffer, dpi=_DPI)
         return base64.b64encode(buffer.getvalue()).decode()
-
-    def _range(self, name: str) -> tuple[float, float]:
-        """Range of colour of a pane, computed once."""
-        if name not in self._limits:
-            self._limits[name] = self.view.limits(name)
-        return self._limits[name]
 
     def _on_message(self, _: object, content: dict[str, Any], __: Sequence[object]) -> None:
         """Answer a request of the page; an error is an answer, too."""

@@ -19,6 +19,7 @@ import re
 import struct
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import partial
@@ -326,14 +327,13 @@ class Boson(Closing):
         self._command("run FFC", RUN_FFC)
         deadline = self._clock() + timeout
         while True:
-            try:
+            # Without a reply, while the shutter is closed, it asks again until the time limit.
+            with suppress(BosonTimeoutError):
                 busy = bool(self.read(FFC_IN_PROGRESS, repeats=0))
                 if busy or self.read(FFC_STATUS, repeats=0) != FfcStatus.COMPLETE:
                     changed = True
                 elif (last := self.read(LAST_FFC_FRAME, repeats=0)) != before or changed:
                     return last
-            except BosonTimeoutError:
-                pass  # no reply while the shutter is closed: requested again until the time limit
             if self._clock() >= deadline:
                 raise BosonTimeoutError(f"No flat-field correction within {timeout:g} s.")
             self._clock.sleep(POLL)

@@ -210,12 +210,9 @@ class FilterWheel(Closing):
         # The move, until the wheel is there.
         self._controller.begin(Id.MOT_MOVE_ABSOLUTE, data=apt.pack(apt.Position(CHANNEL, target)))
         name, limits = f"Move to {scale.degrees(target):.2f} deg", (MOVE_TIMEOUT, STALL_TIMEOUT)
-
-        def arrived(status: apt.Status) -> bool:
-            return abs(scale.degrees(status.position - target)) <= TOLERANCE
-
+        action = name, Id.MOT_MOVE_COMPLETED, limits
         try:
-            self._follow(name, Id.MOT_MOVE_COMPLETED, limits, arrived)
+            self._follow(*action, lambda it: abs(scale.degrees(it.position - target)) <= TOLERANCE)
         except StalledWheelError:
             self._is_lost = True
             raise

@@ -115,10 +115,8 @@ class Watch:
 
     def status(self) -> dict[str, Status]:
         """Band to its `Status` at the last preview; empty before the first one."""
-        statuses: dict[str, Status] = {}
-        if not self._past:
-            return statuses
-        last = self._past[-1]
+        statuses = dict[str, Status]()
+        last = self._past[-1] if self._past else Preview(0.0, {}, {}, {})
         for band, totals in last.totals.items():
             values: dict[str, Any] = {**totals, "ffc": _ffc(band, last)}
             # The temperature by its reading, else by the telemetry.

@@ -189,9 +189,8 @@ class Capture(Closing):
             codes = [code.to_bytes(4, "little") for code in offered]
             names = [code.decode("ascii", "backslashreplace") for code in codes]
             raise ValueError(f"Invalid video node '{self.path}' with {names}. Must offer 'Y16 '.")
-        driver, model, bus = (
-            raw.rstrip(b"\0").decode("utf-8", "backslashreplace") for raw in texts
-        )
+        texts = [raw.rstrip(b"\0").decode("utf-8", "backslashreplace") for raw in texts]
+        driver, model, bus = texts
         release = f"{version >> 16}.{version >> 8 & 0xFF}.{version & 0xFF}"
         return {"model": model, "bus": bus, "driver": f"{driver} {release}"}
 

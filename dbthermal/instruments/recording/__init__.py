@@ -239,24 +239,18 @@ def bench_series(
         ValueError as for `open_sweep`; or if a region has no pixel or a band no good frame.
     """
     steps, stability, shared = _sweep(folder, name)
-    series: dict[str, list[xr.Dataset]] = {material: [] for material in region}
-    for paths in steps:
-        background = _agreed(paths, BLACKBODY, stability)
-        views = _views(paths)
-        for material, place in region.items():
-            means = [_mean(view, place, correction) for view in views.values()]
-            temperature = _agreed(paths, material, stability)
-            values = {"object_temperature": temperature, "background_temperature": background}
-            measurement = xr.Dataset({"counts": ("band", means), **values}, {"band": [*views]})
-            series[material].append(measurement)
-    # All steps of a material together.
-    joined = {}
-    for material, measurements in series.items():
-        dataset = xr.concat(measurements, "measurement").transpose("band", "measurement")
-        for variable, described in schema.STAGES["contact"].items():
-            dataset[variable].attrs = described.attrs
-        joined[material] = schema.check(dataset.assign_attrs(shared, material=material), "contact")
-    return joined
+    views = [_views(paths) for paths in steps]
+    background = [_agreed(paths, BLACKBODY, stability) for paths in steps]
+    bands, series = [*views[0]], dict[str, xr.Dataset]()
+    for material, place in region.items():
+        values = {
+            "counts": [[_mean(it[band], place, correction) for it in views] for band in bands],
+            "object_temperature": [_agreed(paths, material, stability) for paths in steps],
+            "background_temperature": background,
+        }
+        dataset = xr.Dataset(schema.variables("contact", values), {"band": bands}, shared)
+        series[material] = schema.check(dataset.assign_attrs(material=material), "contact")
+    return series
 
 
 def step_path(folder: str | Path, name: str, number: int, band: str | None) -> Path:
@@ -275,11 +269,6 @@ def require_filter(path: str | Path, band: str | None) -> None:
         label = f"Invalid slots {sorted(slots)} of the wheel in the recording '{path}'"
         rule = f"that of filter '{band}' throughout: move it away, and record it again"
         raise ValueError(f"{label}. Must be {rule}.")
-
-
-def is_complete(path: str | Path) -> bool:
-    """True if a recording exists and went to its planned end."""
-    return Path(path).exists() and bool(store.open_dataset(path).attrs.get("complete", False))
 
 
 def mean_reading(path: str | Path, source: str) -> float:
@@ -304,14 +293,14 @@ def _sweep(folder: str | Path, name: str) -> tuple[list[list[Path]], float, dict
     for number in range(len(blackbody["temperatures"])):
         steps.append([step_path(folder, name, number, band) for band in bands])
         for path, band in zip(steps[-1], bands, strict=True):
-            if not is_complete(path):
+            if not (path.exists() and store.open_dataset(path).attrs.get("complete", False)):
                 state = f"{'Incomplete' if path.exists() else 'Missing'} recording '{path}'"
                 raise ValueError(f"{state} of the sweep. Must be recorded to its end.")
             require_filter(path, band)
     stated = {key: blackbody.get(name) for key, name in _ACCURACY.items()}
-    shared = {key: attrs[key] for key in ("is_simulated", "origin")} | stated
-    valid = {key: value for key, value in shared.items() if value is not None}
-    return steps, blackbody["stability"], valid
+    shared = {key: attrs[key] for key in ("is_simulated", "origin")}
+    shared |= {key: value for key, value in stated.items() if value is not None}
+    return steps, blackbody["stability"], shared
 
 
 def _agreed(paths: list[Path], source: str, stability: float) -> float:

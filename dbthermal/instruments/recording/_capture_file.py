@@ -215,12 +215,9 @@ class CaptureFile:
         if kind is Note.READING and source != band and band in self._bands:
             status = FfcStatus(int(value)) if value in set(FfcStatus) else None
             self._bands[band].ffc_status = time, status
-        self._notes.append(self._row(kind, source, time, value))
+        self._notes.append((time - self._origin, int(kind), self._names.index(source), value))
         if self._notes[-1][0] - self._notes[0][0] > _HELD:
             self._write_notes()
-
-    def _row(self, kind: Note, source: str, time: float, value: float) -> tuple[float, ...]:
-        return time - self._origin, int(kind), self._names.index(source), value
 
     def refused(self, band: str, number: int, time: float) -> None:
         """Count frames of a band that came and were not taken, and note it."""
@@ -298,7 +295,7 @@ class CaptureFile:
         self.broken = True
         if (place := self.recording.place()) != self._place:
             self._place = place
-            self._notes.append(self._row(Note.FOLDER_MOVED, _RECORDER, self._clock(), math.nan))
+            self.note(Note.FOLDER_MOVED, _RECORDER, self._clock())
         if self._notes:
             names = ("log_time", "log_kind", "log_source", "log_value")
             columns = zip(names, zip(*self._notes, strict=True), strict=True)
