@@ -210,9 +210,12 @@ class FilterWheel(Closing):
         # The move, until the wheel is there.
         self._controller.begin(Id.MOT_MOVE_ABSOLUTE, data=apt.pack(apt.Position(CHANNEL, target)))
         name, limits = f"Move to {scale.degrees(target):.2f} deg", (MOVE_TIMEOUT, STALL_TIMEOUT)
-        action = name, Id.MOT_MOVE_COMPLETED, limits
+
+        def arrived(status: apt.Status) -> bool:
+            return abs(scale.degrees(status.position - target)) <= TOLERANCE
+
         try:
-            self._follow(*action, lambda it: abs(scale.degrees(it.position - target)) <= TOLERANCE)
+            self._follow(name, Id.MOT_MOVE_COMPLETED, limits, arrived)
         except StalledWheelError:
             self._is_lost = True
             raise
