@@ -12,7 +12,7 @@ HOUSE = Path(dbthermal.__file__).parent
 BUDGET = {
     "": (3471, 15),
     "_cli": (1254, 5),
-    "alignment": (2858, 10),
+    "alignment": (2861, 10),
     "calibration": (740, 2),
     "correction": (1704, 5),
     "emissivity": (411, 1),
@@ -26,7 +26,7 @@ BUDGET = {
     "simulation": (541, 1),
     "store": (1366, 6),
 }
-INSTALLED = 35_877  # lines of all rooms
+INSTALLED = 35_880  # lines of all rooms
 
 PRONOUNS = {
     *("one", "other", "others", "own", "part", "parts", "some", "here", "there", "told", "known"),

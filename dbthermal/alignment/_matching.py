@@ -137,17 +137,19 @@ def inside(places: Array, valid: Mask) -> Mask:
 def _information(movies: Movies, shift: Array) -> Information:
     r"""Information on a step of the field at each pixel, by Gauss-Newton.
 
-    With a ratio k for each window, the moved movie m and its slopes g, the residual r of a pixel is
-    :math:`k \, g^T d + u m + \sigma^2 g^T \nabla (k + u)` beside noise: u, of a variance that the
-    window tells, is the pixel's ratio less the window's, as beside a border of materials, and a
-    blur by sigma of what has an uneven ratio moves it. So
+    With the moved movie m, its slopes g and a ratio k of a window, the residual of a pixel is
 
-    .. math:: A = k^2 \sum_t g g^T - q \, (g m)(g m)^T, \quad
-              b = k \sum_t g r - q \, (g m)(m r) - A \sigma^2 \nabla (k + u) / k,
-              \quad q = \frac{\tau^2}{s^2 + \tau^2 \sum_t m^2}
+    .. math:: r = k \, g^T d + u m + \sigma^2 g^T \nabla (k + u)
+
+    beside noise. The pixel's ratio differs by u, as beside a border of materials, with a variance
+    that the window tells; and a blur of deviation sigma moves what it sees of an uneven ratio. So
+
+    .. math:: q = \frac{\tau^2}{s^2 + \tau^2 \sum m^2}, \quad
+              A = k^2 \left[\sum g g^T - q \sum g m \sum m g^T\right], \quad
+              b = k \left[\sum g r - q \sum g m \sum m r\right] - A \sigma^2 \nabla (k + u) / k
 
     over s^2, less what noise makes of the slopes; s^2 is the noise's variance where the residual is
-    noise, and larger where it is not.
+    noise, and larger where it is not. Sums are over time.
     """
     places, used = movies.pairs(shift)
     noise = movies.noise[0] * _VALUE_NOISE
@@ -174,6 +176,7 @@ def _information(movies: Movies, shift: Array) -> Information:
         misfit = np.maximum(1.0 + excess / (number * movies.outside), 1.0)
         weight = used * ratio / (misfit * variance)
         yy, yx, xx = yy - share * my**2, yx - share * my * mx, xx - share * mx**2
+        # By as much as the blur moves what it sees of an uneven ratio, the shift is not off.
         moved = free * BLUR**2 * np.stack(np.gradient(ratio + share * along))
         steps = (
             yh - ratio * my - share * my * along - yy * moved[0] - yx * moved[1],

@@ -386,7 +386,7 @@ def solve(
         numbers = (material.inverse_energy, material.emissivity)
         spreads = (material.noise_variance, material.drift_variance, material.spread)
         materials[:] = np.stack([*numbers, *spreads, *material.ratio], 1)
-    errors = np.empty((2, pixels, bands))  # in the order of `np.stack` it would be compiled anew
+    errors = np.empty((2, pixels, bands))  # of one layout: each is compiled by itself
     errors[:] = tile.scaled(tile.noise).T, tile.scaled(tile.pattern or (0.0,) * bands).T
     films = np.empty((4, frames, pixels), np.float32)
     record = np.zeros(pixels, RECORD).view(np.recarray)  # has its names also where not compiled
