@@ -65,13 +65,18 @@ class Image:
         """Values (..., material) at each pixel (..., pixel); NaN at those without a material."""
         return np.where(self.labels >= 0, values[..., self.labels], np.nan)
 
-    def gradient(self, label: int, measured: Labels, cost: gradients.Cost) -> gradients.Gradient:
-        """Gradient at all pixels of a label, from some that are surveyed, see `gradients.fit`."""
+    def gradient(
+        self, label: int, measured: Labels, cost: gradients.Cost, lowest: float, highest: float
+    ) -> gradients.Gradient:
+        """Gradient at all pixels of a label between limits, from surveyed ones; `gradients.fit`."""
         asked = np.flatnonzero(self.labels == label)
         start, places = (
             np.divmod(pixels, self.width) for pixels in (self.surveyed[measured], asked)
         )
-        return gradients.fit(start, places, cost)
+        result = gradients.fit(start, places, cost)
+        # A polynomial may leave the limits beyond the surveyed pixels: then it is a constant.
+        within = (result.value > lowest) & (result.value < highest)
+        return result if np.all(within) else gradients.fit(start, places, cost, highest=0)
 
 
 def total(labels: Labels, values: Array, count: int) -> Array:
@@ -317,7 +322,10 @@ def _with_gradients(
         for number, across in enumerate(axes.T[1:], 1):
             square, variances = seen[0, 0] - seen[number, number], seen[0, 0] + frames[pixels]
             cost = gradients.Cost(square, seen[number, 0], variances)
-            gradient = image.gradient(label, pixels, cost)
+            # Between the angles at which a band's ratio would be zero.
+            zeros = axes[:, 0] / np.where(across == 0.0, np.nan, -across)
+            limits = np.nanmax(zeros[zeros < 0.0]), np.nanmin(zeros[zeros > 0.0])
+            gradient = image.gradient(label, pixels, cost, *limits)
             if gradient.degree > 0:
                 vector = vector + gradient.value * across[:, np.newaxis]
                 variance[asked] = np.maximum(variance[asked], length * gradient.variance)
@@ -408,7 +416,8 @@ def _graded(
         pixels = np.flatnonzero(labels == label)
         difference, noise, weight = (values[pixels] for values in sample)
         cost = gradients.Cost(weight, weight * difference, weight**2 * noise)
-        fits.append(image.gradient(label, pixels, cost))
+        mean = emissivity[image.labels == label][0]
+        fits.append(image.gradient(label, pixels, cost, -mean, 1.0 - mean))
     for label, fit, spread in zip(every, fits, gradients.spreads(fits), strict=True):
         pixels = image.labels == label
         # What differs by no more than the error from drift may be that.
