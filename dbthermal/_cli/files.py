@@ -15,12 +15,10 @@ import numpy as np
 import xarray as xr
 
 from dbthermal import _arrays, readers, schema, store
-from dbthermal._arrays import on_disk
 from dbthermal._cli import PLUS, accepted, is_source, leaves
 from dbthermal.explorer._answer import answer
 from dbthermal.readers import _formats as formats
 from dbthermal.response import ACCURACY
-from dbthermal.schema import warned
 from dbthermal.store import _integrity as integrity
 
 _MADE_BY = {
@@ -101,7 +99,7 @@ def recording(paths: list[Path], options: Namespace, camera: int = 0) -> xr.Data
     several = kind in {"FLIR", "TIFF"}  # whose files make one recording together
     if len(paths) > 1 and not several:
         raise ValueError(f"Invalid list of {len(paths)} {kind}. Must be joined in a file or store.")
-    with on_disk(_room(options)):  # films that are large
+    with _arrays.on_disk(_room(options)):  # films that are large
         movie = reader(paths if several else paths[0], **stated)
     if of_reader and (first := stated["frames"].start):  # times since the first frame of the files
         ends = reader(paths, **{**stated, "frames": slice(0, first + 1, first)})
@@ -182,7 +180,7 @@ def capture(paths: list[Path], options: Namespace, offset: Any) -> xr.Dataset:
         label = f"Invalid --bands of {number} names: {', '.join(options.bands)}"
         raise ValueError(f"{label}. Must be {len(cameras)}, one for each camera, with spaces.")
     movies = [recording(files, options, camera) for camera, files in enumerate(cameras)]
-    with on_disk(_room(options)):
+    with _arrays.on_disk(_room(options)):
         return readers.two_bands(*movies, bands=options.bands, offset=offset)
 
 
@@ -214,11 +212,11 @@ def make_capture(options: Namespace) -> dict[str, Any]:
     lengths = np.atleast_1d(stamps.max("time") - stamps.min("time"))
     if np.ptp(lengths) > _UNEQUAL * lengths.max():
         label = f"The cameras recorded {' and '.join(f'{length:.1f} s' for length in lengths)}"
-        scene = warned(scene, f"{label}. Must be the same time: is a part of one missing?")
+        scene = schema.warned(scene, f"{label}. Must be the same time: is a part of one missing?")
     fewest = separation.get_method("subspace").minimum_frames
     if (frames := scene.sizes["time"]) < fewest:
         rule = f"Must be at least {fewest} to be separated, better 200 to 400"
-        scene = warned(scene, f"Too few frames of the capture: {frames}. {rule}.")
+        scene = schema.warned(scene, f"Too few frames of the capture: {frames}. {rule}.")
     return saved(scene, options)
 
 

@@ -28,10 +28,8 @@ from dbthermal import (
 )
 from dbthermal._cli import PLUS, accepted, files, leaves
 from dbthermal._text import check_listed, repeated
-from dbthermal.limits import SKY_LEVEL
 from dbthermal.readers._recording import optional
 from dbthermal.response import ACCURACY
-from dbthermal.schema import warned
 from dbthermal.separation._doubts import hardly_measured
 from dbthermal.separation._quality import MOST_MISSING
 from dbthermal.separation._run import BASE
@@ -248,7 +246,7 @@ def separate(options: Namespace) -> dict[str, Any]:
     elif options.method is None:  # the default call, in memory
         notes = [note for data in (source, response) for note in data.attrs.get("warnings", [])]
         result = separation.separate(source.load(), response, **named)
-        return files.saved(warned(result, *notes, *hardly_measured(result)), options)
+        return files.saved(schema.warned(result, *notes, *hardly_measured(result)), options)
     else:  # a single method, by rows
         if options.emissivity:
             axis = {"band": source["band"].values}
@@ -310,7 +308,7 @@ def plan(options: Namespace) -> dict[str, Any]:
         for name in options.materials:
             check_listed("Unknown material", name, table["material"].values.tolist())
         table = table.sel(material=[*dict.fromkeys(options.materials)])
-    level = {"level": SKY_LEVEL} if options.outdoors else {}
+    level = {"level": limits.SKY_LEVEL} if options.outdoors else {}
     design = limits.CaptureDesign(**accepted(limits.CaptureDesign, options), **level)
     noise = emissivity.filter_noise(options.noise, table["band"].values.tolist())
     plans = limits.plan(table, noise, design, outdoors=options.outdoors)

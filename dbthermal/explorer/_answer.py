@@ -8,7 +8,6 @@ from scipy.constants import zero_Celsius
 
 from dbthermal import emissivity, schema
 from dbthermal._arrays import Array, Mask
-from dbthermal.schema import Status
 from dbthermal.separation._doubts import hardly_measured
 
 SPREAD: Final = 0.02  # of emissivities of samples of one material
@@ -64,7 +63,7 @@ def answer(result: xr.Dataset, materials: xr.Dataset | None = None) -> tuple[lis
         name = " or ".join(place["material"] for place in entry["nearest"]) or "many materials"
         sentences.append(f"Emissivity at {entry['pixels']} pixels, like {name}: {values}.")
     doubts = [*result.attrs.get("warnings", []), *hardly_measured(result)]
-    flagged = {bit: np.mean((status & np.uint32(bit)) != 0) for bit in Status}
+    flagged = {bit: np.mean((status & np.uint32(bit)) != 0) for bit in schema.Status}
     doubts += [
         f"{share:.0%} of the pixels are flagged {bit.label}: {bit.meaning}."
         for bit, share in sorted(flagged.items(), key=lambda entry: -entry[1])

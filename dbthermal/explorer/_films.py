@@ -17,7 +17,6 @@ from scipy.special import chdtri
 from dbthermal import _arrays, _numbers, _text, schema, store
 from dbthermal import response as responses
 from dbthermal._arrays import Array, Mask, empty, on_disk, quotient, release
-from dbthermal.schema import laid_on
 
 Values = npt.NDArray[np.float32]
 Progress = Callable[[str, float], object]
@@ -108,11 +107,11 @@ def result_panes(data: xr.Dataset) -> Iterator[Pane]:
     if "object_temperature" not in data:
         label = f"Missing variable 'object_temperature'. Has {sorted(map(str, data))}"
         raise ValueError(f"{label}. Must be a result of separation, or a capture with 'counts'.")
+    film = data["object_temperature"]
     variables = {**schema.STAGES["separated"], **schema.OPTIONAL["separated"]}
     for name in (name for name in variables if name in data):
         schema.check_variable(data[name], variables[name], f"'{name}' of the result")
-        laid_on(data[name], data["object_temperature"], f"'{name}'", "the object temperature")
-    film = data["object_temperature"]
+        schema.laid_on(data[name], film, f"'{name}'", "the object temperature")
     if film.variable._in_memory and (first := float(film[0].median())) < _numbers.KELVIN[0]:
         raise ValueError(f"Invalid object temperature {first:.1f}. Must be in kelvin, not Celsius.")
     # What is estimated, then its deviations: a film each, or a map a band.
@@ -145,7 +144,7 @@ def input_panes(
         return
     counts = schema.check(capture, "capture")["counts"]
     if reference is not None and reference is not capture:
-        counts = laid_on(counts, reference, "the capture", "the result")
+        counts = schema.laid_on(counts, reference, "the capture", "the result")
     for place, band in enumerate(map(str, counts["band"].values)):
         film, label = counts.isel(band=place), f"{band} \N{MICRO SIGN}m input"
         curve = None if response is None else responses.curve(response, band)

@@ -16,7 +16,6 @@ from dbthermal import response as responses
 from dbthermal._arrays import Array, Mask, stride
 from dbthermal.explorer import _films
 from dbthermal.explorer._films import FILMS, Pane, Progress, Region, Values, input_panes
-from dbthermal.schema import Status
 
 Pixels = Literal["unflagged", "measured", "all"]
 
@@ -245,7 +244,7 @@ class View:
         """Deviation (pixel) by the emissivities for a contrast of 1 K; None if all is common."""
         data, (rows, columns) = self.data, box
         displaced = data.attrs.get("reflection_shift", "none") != "none"
-        displaced |= bool((self.status & int(Status.NO_REFLECTION_PAIR)).any())
+        displaced |= bool((self.status & int(schema.Status.NO_REFLECTION_PAIR)).any())
         estimated = {"emissivity", "emissivity_std"} <= set(data) and {*FILMS} <= set(self.panes)
         if pane.name not in FILMS or displaced or not estimated:
             return None
@@ -307,7 +306,7 @@ class View:
         shown = [name for name in names if name != "status"]
         values = {name: (number(name), number(self.panes[name].std)) for name in shown}
         bits = int(self.status[row, column])
-        return {"values": values, "flags": [bit.label for bit in Status if bits & bit]}
+        return {"values": values, "flags": [bit.label for bit in schema.Status if bits & bit]}
 
     def code(
         self, name: str, index: int, regions: Mapping[str, Region], pixels: Pixels = "unflagged"

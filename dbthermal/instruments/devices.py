@@ -7,7 +7,7 @@ imported only then.
 
 import importlib
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Final
@@ -121,14 +121,12 @@ class Devices:
         """Discard frames that the drivers hold of the scene before; SourceLostError if lost."""
         start = self.clock()
         for source in self.sources.values():
-            while self.clock() - start < FLUSH_TIMEOUT:
-                try:
+            with suppress(interface.NoFrameError):
+                while self.clock() - start < FLUSH_TIMEOUT:
                     frame = source.read(0.0)
-                except interface.NoFrameError:
-                    break
-                has_own_clock = interface.FrameFlag.FOREIGN_CLOCK in frame.flags
-                if frame.device_time >= start and not has_own_clock:
-                    break
+                    has_own_clock = interface.FrameFlag.FOREIGN_CLOCK in frame.flags
+                    if frame.device_time >= start and not has_own_clock:
+                        break
 
 
 @contextmanager

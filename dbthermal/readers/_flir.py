@@ -27,7 +27,6 @@ from dbthermal import _numbers
 from dbthermal import _text as texts
 from dbthermal._arrays import Array, Mask, empty, release
 from dbthermal.readers import _formats, _recording
-from dbthermal.readers._formats import Paths
 from dbthermal.readers._recording import MEMORY, Clock, Counts, FileFlag
 from dbthermal.schema import warned
 
@@ -99,7 +98,7 @@ class _Image(NamedTuple):
 
 
 def flir(
-    path: Paths,
+    path: _formats.Paths,
     *,
     frames: slice | None = None,
     clock: Clock | None = None,

@@ -20,7 +20,6 @@ import xarray as xr
 from dbthermal import _numbers, _text, schema
 from dbthermal._arrays import Array, empty, made_on_disk, stretches
 from dbthermal.readers._formats import PNG
-from dbthermal.schema import warned
 
 Counts = npt.NDArray[np.uint16]
 Flags = npt.NDArray[np.uint16]
@@ -353,7 +352,7 @@ def clocked(counts: Counts, clock: Any, name: str, *sentences: str, **attrs: str
         label = f"The times or numbers of '{name}' leave out {missing:.0f} frames"
         rule = "Must be all that were recorded: there are gaps in time in their place"
         doubts.append(f"{label}, the first before frame {late[0]}. {rule}.")
-    return warned(made, *sentences, *doubts)
+    return schema.warned(made, *sentences, *doubts)
 
 
 def _doubts_on_order(counts: Counts, name: str) -> list[str]:

@@ -17,7 +17,6 @@ import xarray as xr
 
 from dbthermal._arrays import Array, empty, release
 from dbthermal.readers import _formats, _recording
-from dbthermal.readers._formats import Paths
 from dbthermal.readers._recording import MEMORY, Clock, Counts
 
 _FORM: Final = (  # tifffile's attribute of a page, or a tag (1 if missing); name, value, rule
@@ -59,7 +58,7 @@ _OVER_TIME: Final = re.compile("[TZIQ]?YX")  # axes as tifffile names them; slic
 
 
 def tiff(
-    path: Paths, *, unit: str, clock: Clock | None = None, memory: float = MEMORY
+    path: _formats.Paths, *, unit: str, clock: Clock | None = None, memory: float = MEMORY
 ) -> xr.Dataset:
     """Counts of a TIFF or BigTIFF stack, or of one TIFF or PNG a frame, in 16 bits.
 

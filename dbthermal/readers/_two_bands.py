@@ -14,7 +14,6 @@ from dbthermal import _numbers, schema
 from dbthermal._arrays import empty, stretches
 from dbthermal._text import shown
 from dbthermal.readers._recording import FileFlag
-from dbthermal.schema import warned
 
 _SCENE: Final = (5.0, 100.0)  # temperatures of a scene [degC]
 _FRAMES: Final = 16  # about as many frames are sampled
@@ -121,7 +120,7 @@ def two_bands(
     }
     capture = schema.check(xr.Dataset(variables, {"band": names, "time": time}, attrs), "capture")
     samples = [film[:: 1 + len(film) // _FRAMES] for film in overlapping]
-    return warned(capture, *_temperatures(samples), *_unchanging(samples, names))
+    return schema.warned(capture, *_temperatures(samples), *_unchanging(samples, names))
 
 
 def _offsets(cameras: Sequence[xr.Dataset], offset: Any) -> list[float]:
