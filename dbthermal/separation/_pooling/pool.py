@@ -66,16 +66,20 @@ class Image:
         return np.where(self.labels >= 0, values[..., self.labels], np.nan)
 
     def gradient(
-        self, label: int, measured: Labels, cost: gradients.Cost, lowest: float, highest: float
+        self,
+        label: int,
+        measured: Labels,
+        cost: gradients.Cost,
+        limits: tuple[float, float] = (-np.inf, np.inf),
     ) -> gradients.Gradient:
-        """Gradient at all pixels of a label between limits, from surveyed ones; `gradients.fit`."""
+        """Gradient at all pixels of a label within limits, from surveyed ones; `gradients.fit`."""
         asked = np.flatnonzero(self.labels == label)
         start, places = (
             np.divmod(pixels, self.width) for pixels in (self.surveyed[measured], asked)
         )
         result = gradients.fit(start, places, cost)
         # A polynomial may leave the limits beyond the surveyed pixels: then it is a constant.
-        within = (result.value > lowest) & (result.value < highest)
+        within = (result.value > limits[0]) & (result.value < limits[1])
         return result if np.all(within) else gradients.fit(start, places, cost, highest=0)
 
 
@@ -325,7 +329,7 @@ def _with_gradients(
             # Between the angles at which a band's ratio would be zero.
             zeros = axes[:, 0] / np.where(across == 0.0, np.nan, -across)
             limits = np.nanmax(zeros[zeros < 0.0]), np.nanmin(zeros[zeros > 0.0])
-            gradient = image.gradient(label, pixels, cost, *limits)
+            gradient = image.gradient(label, pixels, cost, limits)
             if gradient.degree > 0:
                 vector = vector + gradient.value * across[:, np.newaxis]
                 variance[asked] = np.maximum(variance[asked], length * gradient.variance)
@@ -416,8 +420,7 @@ def _graded(
         pixels = np.flatnonzero(labels == label)
         difference, noise, weight = (values[pixels] for values in sample)
         cost = gradients.Cost(weight, weight * difference, weight**2 * noise)
-        mean = emissivity[image.labels == label][0]
-        fits.append(image.gradient(label, pixels, cost, -mean, 1.0 - mean))
+        fits.append(image.gradient(label, pixels, cost))
     for label, fit, spread in zip(every, fits, gradients.spreads(fits), strict=True):
         pixels = image.labels == label
         # What differs by no more than the error from drift may be that.
