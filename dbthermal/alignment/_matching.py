@@ -47,9 +47,9 @@ class Movies:
     """Rapid changes of one picture (y, x, time) [K], blurred alike."""
 
     first: Movie  # its splines
-    others: list[Movie]
+    targets: list[Movie]
     valid: Mask  # pixels (y, x) with data in all
-    noise: Array  # standard deviation of a sample before the blur, first and others [K]
+    noise: Array  # standard deviation of a sample before the blur, first and targets [K]
     freedom: float  # degrees of freedom of a pixel's noise
     outside: float  # degrees of freedom of what a model leaves over these [1]
     lamp: bool  # one function of time holds nearly all changes
@@ -75,14 +75,14 @@ class Movies:
             usual = [MAD * np.median(np.abs(movie[sample])) for movie in movies]
             noise = np.minimum(noise, np.array(usual) / white)
         first = images.splines(movies[0], BLUR)
-        others = [images.blurred(movie, BLUR) for movie in movies[1:]]
+        targets = [images.blurred(movie, BLUR) for movie in movies[1:]]
         # What a model leaves lies all over the frames; but where one function of time holds the
         # changes, as of a lamp, in this one, and a border of materials bends the field.
         energy = np.sum(np.square(first, dtype=np.float64), axis=(0, 1))
         energy -= first[..., 0].size * (noise[0] / factor * _VALUE_NOISE) ** 2
         lamp = bool(energy.max() > _LEADING * np.maximum(energy, 0.0).sum())
         outside = 1.0 / freedom if lamp else max(whole / freedom, 1.0)
-        return cls(first, others, mostly, noise / factor, freedom, outside, lamp, factor)
+        return cls(first, targets, mostly, noise / factor, freedom, outside, lamp, factor)
 
     def centres(self) -> list[Array]:
         """Rows and columns, of the capture, of the pixels' centres."""
@@ -95,7 +95,7 @@ class Movies:
         grids = np.stack([pixels, places])
         # Near the border the blur mirrors, and what is mirrored does not move.
         inner = (grids >= _MIRRORED) & (grids <= shape - 1 - _MIRRORED)
-        return places, inside(places, self.valid) & self.valid & np.all(inner, axis=(0, 1))
+        return places, on_valid(places, self.valid) & self.valid & np.all(inner, axis=(0, 1))
 
 
 def _whole_pixels(
@@ -126,7 +126,7 @@ def _whole_pixels(
     return where - np.reshape(reach, (2, 1, 1)), np.where(best > chance, share, 0.0)
 
 
-def inside(places: Array, valid: Mask) -> Mask:
+def on_valid(places: Array, valid: Mask) -> Mask:
     """Places (2, ...) that lie on valid pixels of an image."""
     near = np.rint(places)
     result = np.all([(n >= 0) & (n < size) for n, size in zip(near, valid.shape, strict=True)], 0)
@@ -156,7 +156,7 @@ def _information(movies: Movies, shift: Array) -> Information:
     total = np.zeros((*used.shape, 6))
     window = partial(gaussian_filter, sigma=WINDOW)
     number = np.maximum(window(used * movies.freedom), 1e-9)
-    moments = images.products(movies.first, movies.others, places) * used[..., np.newaxis]
+    moments = images.products(movies.first, movies.targets, places) * used[..., np.newaxis]
     for sums, level in zip(moments, movies.noise[1:], strict=True):
         mm, my, mx, mh, yy, yx, yh, xx, xh, hh = np.moveaxis(sums, 2, 0)
         auto, terms = np.moveaxis(images.blurred(sums[..., [0, 3]], WINDOW), 2, 0)
@@ -272,7 +272,7 @@ def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Arra
     beside noise, in variances of noise.
     """
     places, used = movies.pairs(shift)
-    sums = images.products(movies.first, movies.others, places, rate) * used[..., np.newaxis]
+    sums = images.products(movies.first, movies.targets, places, rate) * used[..., np.newaxis]
     # Noise of the slopes and of the moved movie.
     number = gaussian_filter(used * movies.freedom, WINDOW)[..., np.newaxis] * movies.noise[0] ** 2
     less = number * np.square([_VALUE_NOISE, _SLOPE_NOISE, _SLOPE_NOISE, 0.0])

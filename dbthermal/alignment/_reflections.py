@@ -208,7 +208,7 @@ def _result(
     shape = capture.valid.shape
     centres = [np.arange(size, dtype=np.float64) for size in shape]
     shift = field.on(centres)
-    reached = matching.inside(np.indices(shape) + shift, np.ones(shape, dtype=bool))
+    reached = matching.on_valid(np.indices(shape) + shift, np.ones(shape, dtype=bool))
     measured = _resolved(data) & reached
     distance = np.asarray(distance_transform_edt(~measured))
     near = (distance <= _NEAR * min(shape)) & reached & measured.any()

@@ -163,8 +163,8 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     # Separate, and widen the bars by what is left.
     capture, (measured, misfit), mended = _mended(laid.capture if laid else corrected, once)
     if laid:
-        left = laid.detail(measured.inputs, measured.result)
-        misfit = replace(misfit, change=np.hypot(misfit.change, left))
+        detail = laid.detail(measured.inputs, measured.result)
+        misfit = replace(misfit, change=np.hypot(misfit.change, detail))
         mended = laid.sentences() + mended
     if colour is not None:
         capture, scale, (measured, misfit) = as_gray(capture, once, measured, colour)
@@ -211,9 +211,9 @@ def _on_one_clock(
         return unchanged
     offsets, std = np.array(aligned.attrs["time_offset"]), aligned.attrs.get("time_offset_std")
     place = int(np.abs(offsets).argmax())
-    known = "" if std is None else f", known to {std:.4f} s"
+    certainty = "" if std is None else f", known to {std:.4f} s"
     sentence = f"The clocks differ: band '{names[place]}' was taken {offsets[place]:+.4f} s after "
-    sentence += f"'{names[0]}'{known}, and was interpolated."
+    sentence += f"'{names[0]}'{certainty}, and was interpolated."
     return aligned, retry, [*(str(note.message) for note in notes), sentence]
 
 
@@ -293,20 +293,20 @@ def _separated(
         shift = displaced.check(reflection_shift, corrected, inputs.bands[0])
         inputs = replace(inputs, displacement=shift)
     # Separate each pixel.
-    alone, surveys = separated(inputs, workers=workers, progress=progress)
+    per_pixel, surveys = separated(inputs, workers=workers, progress=progress)
     if reflection_shift is not None:
-        share = Measured(alone, inputs, None, reflection_shift, []).asynchronous
+        share = Measured(per_pixel, inputs, None, reflection_shift, []).asynchronous
     unexplained = share > (0.0 if reflection_shift is None else _MANY)
     doubts = [_UNEXPLAINED.format(share)] if unexplained else []
     # Pool the pixels of each material, and hold them to what each tells by itself.
-    result = alone
-    pool = partial(separated, alone=alone, surveys=surveys, workers=workers, progress=progress)
+    result = per_pixel
+    pool = partial(separated, alone=per_pixel, surveys=surveys, workers=workers, progress=progress)
     if materials is not None:
         result, _ = pool(replace(inputs, labels=numbered(corrected, materials)))
     elif find_spec("skimage") is not None:
-        result, materials = _over_found_materials(pool, inputs, corrected, alone)
+        result, materials = _over_found_materials(pool, inputs, corrected, per_pixel)
     if materials is not None:
-        hold(alone, result, materials, apart=reflection_shift is not None)
+        hold(per_pixel, result, materials, apart=reflection_shift is not None)
     return Measured(result, inputs, materials, reflection_shift, doubts)
 
 

@@ -71,10 +71,10 @@ class Gradient:
     remainders: tuple[Cost, ...]  # in single pixels, and in squares of some
 
 
-def fit(measured: Places, asked: Places, cost: Cost, highest: int = _DEGREE) -> Gradient:
-    """Gradient at some places from the costs of pixels at known ones, of a degree at most."""
+def fit(measured: Places, asked: Places, cost: Cost, degrees: int = _DEGREE) -> Gradient:
+    """Gradient at some places from the costs of pixels at known ones, up to a degree."""
     fits, pixels = [], cost.square.size
-    for degree in range(highest + 2):
+    for degree in range(degrees + 2):
         functions = powers(measured, measured, degree)
         normal = functions.T @ (cost.square[:, np.newaxis] * functions)
         # A degree has at least four pixels to a coefficient.
@@ -91,14 +91,14 @@ def fit(measured: Places, asked: Places, cost: Cost, highest: int = _DEGREE) -> 
     # Scatter of pixels beyond the highest degree is no gradient.
     beyond = np.sum(fits[-1][-1] ** 2 - cost.variance) / np.sum(cost.square**2)
     variance = cost.variance + max(float(beyond), 0.0) * cost.square**2
-    chosen, most = 0, 0.0
-    for degree, (functions, inverse, coefficients, _) in enumerate(fits[1 : highest + 1], 1):
+    chosen, highest = 0, 0.0
+    for degree, (functions, inverse, coefficients, _) in enumerate(fits[1 : degrees + 1], 1):
         # Chi-square of all coefficients but the constant, less the criterion's price.
         covariance = _covariance(functions, inverse, variance)[1:, 1:]
         terms = coefficients[1:].size
         gain = float(coefficients[1:] @ np.linalg.solve(covariance, coefficients[1:]))
-        if gain - terms * (np.log(pixels) if chosen == 0 else 2.0) > most:
-            chosen, most = degree, gain - 2.0 * terms
+        if gain - terms * (np.log(pixels) if chosen == 0 else 2.0) > highest:
+            chosen, highest = degree, gain - 2.0 * terms
     _, _, coefficients, residual = fits[chosen]
     value = powers(asked, measured, chosen) @ coefficients
     # A degree more may be there, unseen: beyond the pixels that tell something it matters.

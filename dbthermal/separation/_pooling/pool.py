@@ -40,9 +40,9 @@ _REACH, _SINGLE = 2, 3
 _HARDLY: Final = 0.5  # deviation of a ratio pooled over that alone, from which it hardly helps [1]
 _MOSTLY: Final = 0.5  # share of gray pixels from which their material is [1]
 # Square of the difference in deviations that is no chance, of a pixel and of its neighbours [1].
-_MORE, _MORE_AROUND = 4.0, 1.5
+_UNLIKELY, _UNLIKELY_MEAN = 4.0, 1.5
 # Deviation of the neighbourhood that shares such errors [pixel], and its least weight [1].
-_AROUND, _SOME = 1.5, 1e-3
+_VICINITY, _LEAST_WEIGHT = 1.5, 1e-3
 _SQUARE: Final = 8  # side [pixel] of what mirrors the same people at the same time
 _FRAMES: Final = 64  # that tell how much an object differs, about
 
@@ -80,7 +80,7 @@ class Image:
         result = gradients.fit(start, places, cost)
         # A polynomial may leave the limits beyond the surveyed pixels: then it is a constant.
         within = (result.value > limits[0]) & (result.value < limits[1])
-        return result if np.all(within) else gradients.fit(start, places, cost, highest=0)
+        return result if np.all(within) else gradients.fit(start, places, cost, degrees=0)
 
 
 def total(labels: Labels, values: Array, count: int) -> Array:
@@ -140,8 +140,8 @@ def _inner(labels: Labels) -> Labels:
     # What a lens mixes agrees with either material, and biases its ratio by up to 4 deviations.
     inner = minimum_filter(labels, _SINGLE) == maximum_filter(labels, _SINGLE)
     within = np.bincount(labels[inner] + 1, minlength=labels.max() + 2)
-    few = within < _INNER * np.bincount(labels.ravel() + 1)
-    return np.where(inner | few[labels + 1], labels, -1).ravel()
+    narrow = within < _INNER * np.bincount(labels.ravel() + 1)
+    return np.where(inner | narrow[labels + 1], labels, -1).ravel()
 
 
 def select(labels: Labels) -> Mask:
@@ -197,16 +197,16 @@ def _sound(labels: Labels, count: int, survey: Survey, noise: Array) -> tuple[Ra
     outliers = _outliers(labels, ratio_set, ratio_set.common(labels), survey, noise)
     # Near black the few that have an emissivity alone are selected by their own ratio.
     surveyed = np.where(survey.frames[0] > 0, 1.0, 0.0)
-    most = total(labels, measured, count) > _MAJORITY * total(labels, surveyed, count)
-    of_most = np.append(most, False)[labels]
-    used = np.where(outliers & of_most, -1, labels)
+    mostly_measured = total(labels, measured, count) > _MAJORITY * total(labels, surveyed, count)
+    removable = np.append(mostly_measured, False)[labels]
+    used = np.where(outliers & removable, -1, labels)
     for _ in range(_ROUNDS):
         ratio_set = _ratios(used, count, survey, noise, even=True)
         outliers = _outliers(used, ratio_set, ratio_set.common(labels), survey, noise)
         if not np.any(outliers):
             break
         used = np.where(outliers, -1, used)
-    return _ratios(used, count, survey, noise), used, of_most
+    return _ratios(used, count, survey, noise), used, removable
 
 
 def _ratios(
@@ -349,9 +349,9 @@ def _common(
     image: Image, labels: Labels, sound: tuple[Ratios, Labels, Mask], survey: Survey, noise: Array
 ) -> tuple[Material, Labels]:
     """Ratios of all pixels with their gradients, and labels of the pixels that agree with them."""
-    ratio_set, used, most = sound
+    ratio_set, used, removable = sound
     # Few pixels with an emissivity alone, a selection by their ratios, tell no gradient.
-    seen = np.where(most, used, -1)
+    seen = np.where(removable, used, -1)
     common, uneven = _with_gradients(image, seen, ratio_set, survey, noise)
     if not np.any(uneven):
         return common, used
@@ -360,12 +360,12 @@ def _common(
     for _ in range(_GRADED):
         local = common.select_pixels(image.surveyed)
         used = np.where(uneven[labels], labels, used)
-        used = np.where(most & _outliers(used, ratio_set, local, survey, noise), -1, used)
+        used = np.where(removable & _outliers(used, ratio_set, local, survey, noise), -1, used)
         change = ratio_set.ratio[:, labels] / local.ratio
         factor = np.where(np.isfinite(change), change, 1.0)
         even = replace(survey, scatter=survey.scatter * factor[:, np.newaxis] * factor)
         ratio_set = _ratios(used, uneven.size - 1, even, noise)
-        common, _ = _with_gradients(image, np.where(most, used, -1), ratio_set, survey, noise)
+        common, _ = _with_gradients(image, np.where(removable, used, -1), ratio_set, survey, noise)
     return common, used
 
 
@@ -466,21 +466,21 @@ def hold(
     films = [result["object_temperature"].values for result in (pooled, per_pixel)]
     # Mean square D of the objects' difference, in deviations of the pixel alone.
     square, variance = np.zeros((2, *common.shape))
-    every = slice(None, None, max(1, len(single) // _FRAMES))
+    sampled = slice(None, None, max(1, len(single) // _FRAMES))
     for row, columns in enumerate(sound & valid):
-        samples = (film[every, row, columns] for film in (*films, single))
+        samples = (film[sampled, row, columns] for film in (*films, single))
         value, lone, std = (sample.astype(np.float64) for sample in samples)
         square[row, columns] = np.nanmean(((value - lone) / std) ** 2, axis=0)
         variance[row, columns] = np.nanmean(std**2, axis=0)
         release()
     # Of cameras apart, pixels that stay alone have their deviations widened, too.
-    unlike = np.where(stay & apart & (square > _MORE), square, 0.0)
+    unlike = np.where(stay & apart & (square > _UNLIKELY), square, 0.0)
     local = np.where(common, _neighbour_mean(square, common), 0.0)
     whole, size = median_filter(labels.values, _SINGLE, mode="nearest"), 1 + 2 * _REACH
     border = minimum_filter(whole, size) < maximum_filter(whole, size)
     # D times the variance alone is added if D of the pixel or around is no chance, or at a border.
-    more = common & (border | (square > _MORE) | (local > _MORE_AROUND))
-    square = np.where(more, np.maximum(square, local), 1.0 * (stay & sound))
+    widened = common & (border | (square > _UNLIKELY) | (local > _UNLIKELY_MEAN))
+    square = np.where(widened, np.maximum(square, local), 1.0 * (stay & sound))
     mean = _neighbour_mean(square * variance, common | (stay & sound))
     constant = np.where(valid & ~sound, mean, 0.0)
     factor, film = square * common, pooled["object_temperature_std"].values
@@ -507,5 +507,5 @@ def _share(labels: Array, holds: Mask) -> Array:
 
 def _neighbour_mean(values: Array, counted: Mask) -> Array:
     """Mean (y, x) of the known pixels around."""
-    sums = gaussian_filter(np.where(counted, values, 0.0), _AROUND)
-    return np.asarray(sums / np.maximum(gaussian_filter(counted * 1.0, _AROUND), _SOME))
+    sums = gaussian_filter(np.where(counted, values, 0.0), _VICINITY)
+    return np.asarray(sums / np.maximum(gaussian_filter(counted * 1.0, _VICINITY), _LEAST_WEIGHT))
