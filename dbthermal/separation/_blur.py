@@ -32,7 +32,7 @@ _AROUND: Final = 13  # pixels along a side of a neighbourhood with one error of 
 _BORDER, _ALIKE, _MOSTLY = 7, 1.05, 0.2
 # Blur of both bands [pixel^2], against noise: it leaves their difference as it is.
 _COMMON: Final = 2.0
-_BROAD: Final = 5.0  # deviation of the blur that tells what is broad [pixel]
+_BROAD: Final = 25.0  # blur that tells what is broad [pixel^2]
 _FEWEST: Final = 16  # rows and columns of an image, whose edges are left out, at least
 _EDGE: Final = 6  # pixels at the image's edge that are left out
 _MOVING: Final = 1.0  # variance of the changes over that of noise
@@ -156,9 +156,10 @@ def _difference(inputs: Inputs, result: xr.Dataset, place: int) -> float:
     return 0.0
 
 
-def _details(image: Array, deviation: float) -> Array:
-    """An image blurred, less its broad part, in which rapid heat spreads."""
-    return _blurred(image, deviation) - _blurred(image, _BROAD)
+def _details(image: Array, excess: float) -> Array:
+    """An image blurred by an excess [pixel^2], less its broad part, in which rapid heat spreads."""
+    fine, broad = (_blurred(image, float(np.sqrt(it + excess))) for it in (_COMMON, _BROAD))
+    return fine - broad
 
 
 def _equations(
@@ -181,7 +182,7 @@ def _equations(
     least = ndimage.minimum_filter(ratio, _BORDER)
     within = ndimage.maximum_filter(ratio, _BORDER) < _ALIKE * least
     used &= within | (np.count_nonzero(used & within) < _MOSTLY * np.count_nonzero(used))
-    blurs = np.sqrt(_COMMON + np.array([max(excess, 0.0), max(-excess, 0.0)]))
+    blurs = max(excess, 0.0), max(-excess, 0.0)
     basis = misfits.smooth_functions(inputs, frames)
     # Leading functions of time hold most of the rapid changes, at less cost.
     if leading is not None:
@@ -205,7 +206,7 @@ def _equations(
     # Noise in the products: that of the first band, in all three.
     free = len(basis) - basis.shape[1]
     levels = inputs.noise[[inputs.bands[0], inputs.bands[place]]] ** 2
-    point = np.zeros((1 + 2 * int(np.ceil(4.0 * _BROAD)),) * 2)
+    point = np.zeros((1 + 2 * int(np.ceil(4.0 * np.sqrt(_BROAD))),) * 2)
     point[point.shape[0] // 2, point.shape[1] // 2] = 1.0
     spread = _details(point, blurs[0])
     bent = ndimage.laplace(spread)
