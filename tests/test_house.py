@@ -22,7 +22,7 @@ BUDGET = {
     "limits": (663, 2),
     "readers": (2763, 10),
     "reporting": (363, 1),
-    "separation": (12712, 48),
+    "separation": (12766, 48),
     "simulation": (541, 1),
     "store": (1366, 6),
 }
