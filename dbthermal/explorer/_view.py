@@ -147,10 +147,10 @@ class View:
         return good | ((self.status & COMPLETED) != 0) if pixels == "unflagged" else good
 
     def limits(self, name: str) -> tuple[float, float]:
-        """Range of colour of a pane: 1st and 99th percentile of some values, measured if any is."""
+        """Range of colour of a pane: 1st and 99th percentile of some values, unflagged if any."""
         pane, times = self.pane(name), slice(0, None, -(-self.time.size // _RANGE[0]))
         every = slice(0, None, stride(self.shape, _RANGE[1]))
-        values, good = pane.read(times, every, every), self.counted("measured")[every, every]
+        values, good = pane.read(times, every, every), self.counted()[every, every]
         for shown in (values[:, good], values):
             finite = shown[np.isfinite(shown)]
             if finite.size:

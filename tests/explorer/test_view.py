@@ -200,9 +200,12 @@ def answer(explorer: Any, **question: Any) -> tuple[dict[str, Any], list[bytes]]
     return result
 
 
-def test_a_missing_deviation_leaves_the_range_of_colour() -> None:
-    """Colours of an emissivity have a range where its deviation lacks at a pixel, or at all."""
+def test_ranges_of_colour() -> None:
+    """They are those of completed pixels, too, and need no deviation, at a pixel or at all."""
     data = separated()
+    data["object_temperature"].values[:, 1] += 20.0
+    data["status"].values[1] = Status.COMPLETED_FROM_PRIOR
+    assert View(data).limits("object_temperature") == pytest.approx((310.0, 332.0))
     for pixels in (0, slice(None)):
         data["emissivity_std"].values[:, pixels] = np.nan
         low, high = View(data).limits("emissivity 9.5")
