@@ -351,7 +351,7 @@ REASONS: Final = MappingProxyType(
         "no_reflection_pair": ("reflection not seen by the second camera", "#d9d9d9"),
         "object_jump": ("object jumps", "#7f3b08"),
         "bands_apart": ("bands see the reflection at different times", "#b35806"),
-        "object_not_smooth": ("object changes too fast, or noise is another", "#e08214"),
+        "object_not_smooth": ("object changes too fast, or noise is too high", "#e08214"),
         "roles_may_be_swapped": ("object and reflection may be swapped", "#fdb863"),
         "no_background_motion": ("no motion reflected: nothing can be told", "#08306b"),
         "gray": ("same emissivity in all bands: nothing can be told", "#00868b"),

@@ -50,7 +50,6 @@ _FASTEST: Final = 30.0  # Hz
 _SAMPLES: Final = 600_000  # of each film in the viewer, at most, in `VIEWED` frames
 VIEWED: Final = 80
 _NO_VALUE: Final = 65535  # of 16 bits
-_LEAST: Final = 0.01  # between both ends of the colours [K]
 
 
 def report(  # noqa: PLR0913 - what is shown beside the result, by name
@@ -168,7 +167,7 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
         named=bool(regions),
         bands=[drawing.band_label(band) for band in bands],
         spread=SPREAD,
-        attrs=result.attrs,
+        result=result,
         events=view.events,
         provenance=json.dumps(made_by, indent=2, sort_keys=True),
         script=Markup(script.read_text("utf-8")),
@@ -242,7 +241,8 @@ def _outlines(view: View, chosen: Mapping[str, Region], *, celsius: bool) -> Fig
         mask = region.mask(view.shape)[::step, ::step]
         if mask.all():
             continue
-        axes[0, 0].contour(mask, [0.5], colors=[color], linewidths=1.5)
+        lines = axes[0, 0].contour(mask, [0.5], colors=[color], linewidths=1.5)
+        lines.set_path_effects([withStroke(linewidth=3.5, foreground="white")])
         row, column = (float(places.min()) for places in np.nonzero(mask))
         across, above = column < mask.shape[1] / 2, row > mask.shape[0] / 10
         side: Any = {"ha": "left" if across else "center", "va": "bottom" if above else "top"}
@@ -336,8 +336,6 @@ def viewer(view: View, *, celsius: bool) -> dict[str, Any]:
         values, time = film.values.astype(np.float64), film["time"].values
         finite = values[np.isfinite(values)]
         low, high = (finite.min(), finite.max()) if finite.size else (0.0, 1.0)
-        shown = np.percentile(finite, [1, 99]).tolist() if finite.size else [low, high]
-        shown = [0.0 if name in stds else shown[0], max(shown[1], shown[0] + _LEAST)]
         high = high if high > low else low + 1.0
         # Values as whole numbers of 16 bits, the largest of which has none.
         scaled = np.nan_to_num((values - low) / (high - low)) * (_NO_VALUE - 1)
@@ -345,8 +343,9 @@ def viewer(view: View, *, celsius: bool) -> dict[str, Any]:
         # Changes from frame to frame, low bytes before high ones, which compress well.
         changes = np.diff(codes, axis=0, prepend=np.zeros_like(codes[:1])).astype("<u2")
         planes = changes.view("u1").reshape(-1, 2).T.tobytes()
-        quantity: Any = {"name": name, "label": pane.label, "unit": pane.unit(celsius=celsius)[0]}
-        quantity |= {"low": float(low), "high": float(high), "shown": shown}
+        unit, zero = pane.unit(celsius=celsius)
+        quantity: Any = {"name": name, "label": pane.label, "unit": unit, "low": float(low)}
+        quantity |= {"high": float(high), "shown": [end - zero for end in view.limits(name)]}
         quantities.append({**quantity, "data": base64_text(zlib.compress(planes, 9))})
     colors = np.rint(255 * mpl.colormaps["inferno"](np.linspace(0, 1, 256))[:, :3]).astype(np.uint8)
     # Pixels that are completed (1), or have another flag (2).

@@ -35,9 +35,9 @@
   };
   const text = (number) => (Number.isNaN(number) ? "no value" : number.toFixed(2));
 
-  // Round numbers between two ends, as text by value: about four.
+  // Round numbers between two ends, as text by value: about six.
   function ticks(low, high) {
-    const rough = (high - low) / 4, power = 10 ** Math.floor(Math.log10(rough));
+    const rough = (high - low) / 6, power = 10 ** Math.floor(Math.log10(rough));
     const step = power * [1, 2, 5, 10].find((factor) => factor * power >= rough);
     const digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9)), found = [];
     for (let at = Math.ceil(low / step - 1e-9); at * step <= high + 1e-9 * step; at++) {
@@ -46,18 +46,19 @@
     return found;
   }
 
-  // Lines over the pixels that are completed (white), or have another flag (black).
+  // Lines over the pixels that are completed (falling), or have another flag (rising), seen on dark and bright pixels.
   const lines = new OffscreenCanvas(picture.width, picture.height);
   for (const [kind, color, slope] of [[1, "#fff", 1], [2, "#000", -1]]) {
     const mask = new OffscreenCanvas(width, height), image = mask.getContext("2d").createImageData(width, height);
     marks.forEach((mark, at) => { image.data[4 * at + 3] = mark === kind ? 255 : 0; });
     mask.getContext("2d").putImageData(image, 0, 0);
     const layer = new OffscreenCanvas(picture.width, picture.height), context = layer.getContext("2d");
-    context.strokeStyle = color;
+    Object.assign(context, { strokeStyle: color, shadowColor: kind === 1 ? "#000" : "#fff", shadowOffsetX: 1 });
     for (let at = -picture.height; at < picture.width + picture.height; at += 8) {
       context.moveTo(at, 0); context.lineTo(at + slope * picture.height, picture.height);
     }
     context.stroke();
+    context.shadowColor = "transparent";
     context.globalCompositeOperation = "destination-in"; context.imageSmoothingEnabled = false;
     context.drawImage(mask, 0, 0, picture.width, picture.height);
     lines.getContext("2d").drawImage(layer, 0, 0);
@@ -142,11 +143,15 @@
     context.fillText("time [s]", (left + right) / 2, bottom + 34);
     context.textAlign = "left"; context.fillText(`${quantity.label} [${quantity.unit}]${std ? ", two standard deviations" : ""}`, left, top - 8);
     context.fillStyle = "#1b6ca855"; context.strokeStyle = getComputedStyle(root).getPropertyValue("--blue");
+    // Two standard deviations, from frame to frame with values.
+    context.beginPath();
     values.forEach((here, index) => {
-      if (Number.isFinite(here) && errors[index] > 0) {
-        context.fillRect(x(index) - 1, y(here + errors[index]), Math.max(2, (right - left) / last), y(here - errors[index]) - y(here + errors[index]));
-      }
+      const [before, margins] = [index - 1, [errors[index - 1], errors[index]]];
+      if (!Number.isFinite(here + values[before]) || !Number.isFinite(margins[0] + margins[1])) return;
+      context.moveTo(x(before), y(values[before] + margins[0])); context.lineTo(x(index), y(here + margins[1]));
+      context.lineTo(x(index), y(here - margins[1])); context.lineTo(x(before), y(values[before] - margins[0])); context.closePath();
     });
+    context.fill();
     context.beginPath();
     values.forEach((here, index) => {
       if (Number.isFinite(here)) context[index && Number.isFinite(values[index - 1]) ? "lineTo" : "moveTo"](x(index), y(here));

@@ -26,7 +26,7 @@ WIDTH = "document.querySelector('{part}').getBoundingClientRect().width"
 HOSTILE = "</script><script>document.title = 'taken'</script><img src=x onerror=alert(1)>"
 
 
-def scene(**attrs: str) -> xr.Dataset:
+def scene(**attrs: Any) -> xr.Dataset:
     """Simulated result: glass that warms by 1 K/s from 300 K; a dead pixel, some of a material."""
     time, shape = np.arange(20) / 4.0, (12, 16)
     film = np.broadcast_to(300.0 + time[:, None, None], (20, *shape)).astype(np.float32).copy()
@@ -84,7 +84,8 @@ def test_the_answer_and_the_author_come_first(tmp_path: Path) -> None:
     page = (tmp_path / "scene.html").read_text("utf-8")
     head = page.partition("<h2")[0]
     assert "A. Tester, a.tif and b.tif" in head
-    assert "Object from 26.9 to 31.6 \N{DEGREE SIGN}C, typically \N{PLUS-MINUS SIGN} 0.03 K" in head
+    assert "Object from 26.9 to 31.6 \N{DEGREE SIGN}C, typically" in head
+    assert "\N{PLUS-MINUS SIGN}\N{NO-BREAK SPACE}0.03 K" in head
     assert "Measured: 95% of the pixels; completed, not measured: 4%." in head
     found = numbers(page)["answer"]
     assert found["measured"] == pytest.approx(1 - 9 / 192)
@@ -110,15 +111,18 @@ def test_a_logo_is_in_the_page(tmp_path: Path) -> None:
 
 
 def test_only_measured_pixels_count(tmp_path: Path) -> None:
-    """Completed emissivities, far off here, do not enter the mean; warnings and calibration do."""
-    data = scene(blackbody="4 temperatures of 20.00, 40.00, 60.00, 85.00 degC")
+    """Completed emissivities, far off here, do not enter the mean; what was assumed is listed."""
+    calibration = "4 temperatures of 20.00, 40.00, 60.00, 85.00 degC"
+    data = scene(blackbody=calibration, reflection_shift="given", time_offset=[0.0, 0.25])
+    data["reflection_shift"] = ("axis", "y", "x"), np.full((2, 12, 16), [[[0.0]], [[3.0]]])
     data["emissivity"].values[:, 1, :8] = 0.99
     data.attrs["warnings"] = ["Fixed pattern of 100."]
     dbthermal.report(data, tmp_path / "scene.html")
     page = (tmp_path / "scene.html").read_text("utf-8")
     found = numbers(page)["regions"]["measured pixels of the whole image"]
     assert found["emissivity"]["9.5"] == pytest.approx(0.718)
-    for text in ("<strong>Fixed pattern of 100.</strong>", "20.00, 40.00, 60.00", "data:image/png"):
+    texts = "<strong>Fixed pattern of 100.</strong>", calibration, "data:image/png"
+    for text in (*texts, ">0.00 rows, 3.00 columns<", ">0.0, 0.25<"):
         assert text in page
 
 
@@ -232,6 +236,7 @@ def test_page_works_without_a_network(tmp_path: Path) -> None:
             assert box is not None
             assert box["x"] + box["width"] <= 390
         assert page.evaluate(WIDTH.format(part="figure:not(.film) img")) == 600  # which scrolls
+        assert page.locator("table").evaluate_all("all => all.every((it) => it.offsetWidth <= 350)")
         page.emulate_media(media="print")
         assert page.evaluate(WIDTH.format(part="figure:not(.film) img")) <= 390
         paper = (".scroll", "overflowX", "visible"), ("pre", "whiteSpace", "pre-wrap")
