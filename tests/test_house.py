@@ -16,7 +16,7 @@ BUDGET = {
     "calibration": (740, 2),
     "correction": (1704, 5),
     "emissivity": (411, 1),
-    "explorer": (1250, 6),
+    "explorer": (1251, 6),
     "figures": (577, 2),
     "instruments": (5207, 19),
     "limits": (663, 2),

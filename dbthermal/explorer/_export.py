@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse, Patch, Polygon, Rectangle
+from matplotlib.patheffects import withStroke
 from PIL import Image
 
 from dbthermal import figures, store
@@ -69,7 +70,8 @@ def figure(view: View, shown: Shown) -> Figure:
         # Outlines of the regions, in the colours of their curves.
         for place, region in enumerate(shown.regions.values()):
             color = drawing.COLORS[place % len(drawing.COLORS)]
-            axis.add_patch(_outline(region, fill=False, edgecolor=color, linewidth=1.5))
+            patch = axis.add_patch(_outline(region, fill=False, edgecolor=color, linewidth=1.5))
+            patch.set_path_effects([withStroke(linewidth=3.5, foreground="white")])
     note = drawing.provenance_note(view.data)
     result.suptitle(f"{view.time[shown.index]:.2f} s{note}", fontsize=10)
     return result

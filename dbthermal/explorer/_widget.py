@@ -81,8 +81,7 @@ class Explorer(anywidget.AnyWidget):
         films = [name for name in panes if name.startswith("input ")]
         names = ["object_temperature"] if "object_temperature" in panes else films
         names += [name for name in panes if name == "status" or name.startswith("emissivity ")]
-        limits = {name: self._range(name) for name in names if name != "status"}
-        shown = _export.Shown(names, self._state["index"], {}, self._celsius, limits=limits)
+        shown = _export.Shown(names, self._state["index"], {}, self._celsius)
         buffer = io.BytesIO()
         _export.figure(view, shown).savefig(buffer, dpi=_DPI)
         return base64.b64encode(buffer.getvalue()).decode()

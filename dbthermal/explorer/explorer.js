@@ -69,6 +69,8 @@ function ticks(low, high, count) {
   return Array.from({ length: Math.floor(high / step + 1e-9) - first + 1 }, (_, i) => [(first + i) * step, ((first + i) * step).toFixed(digits)]);
 }
 
+const interval = ({ mean, std }, i) => [-1.96, 1.96].map((factor) => mean(i) + factor * std(i)); // of 95 %
+
 function stroke(context, path, ...lines) {
   for (const [strokeStyle, width] of lines) {
     Object.assign(context, { strokeStyle, lineWidth: width * devicePixelRatio });
@@ -103,8 +105,9 @@ class Picture {
   constructor(explorer, pane) {
     Object.assign(this, { explorer, pane, codes: null, limits: null, sides: null });
     this.box = make(null, "div", "dbt-picture");
-    this.title = make(this.box, "button", "dbt-title", { type: "button", textContent: capital(pane.label), title: "plot the curves of this" });
-    this.title.onclick = () => explorer.choose(pane);
+    this.title = make(this.box, "button", "dbt-title", {
+      type: "button", textContent: capital(pane.label), title: "plot the curves of this", disabled: pane.kind === "status", onclick: () => explorer.choose(pane),
+    });
     this.readout = make(this.box, "div", "dbt-readout");
     this.canvas = make(this.box, "canvas", "dbt-canvas", { tabIndex: 0 });
     this.canvas.dataset.pane = pane.name;
@@ -185,7 +188,7 @@ class Picture {
     (this.spots ?? []).forEach(([row, column, value], hot) => {
       const [across, down] = place(column + 0.5, row + 0.5), tip = hot ? -9 : 9;
       stroke(context, new Path2D(`M${across} ${down}l-5 ${tip}h10z`), ["black", 3], ["white", 1.5]);
-      Object.assign(context, { font: `${11 * devicePixelRatio}px sans-serif`, textAlign: across > width / 2 ? "right" : "left", lineWidth: 3, strokeStyle: "black", fillStyle: "white" });
+      Object.assign(context, { font: `${11 * devicePixelRatio}px sans-serif`, textAlign: across > width / 2 ? "right" : "left", lineWidth: 3 * devicePixelRatio, lineJoin: "round", strokeStyle: "black", fillStyle: "white" });
       const label = [explorer.text(value, pane), across + (across > width / 2 ? -8 : 8), down + (hot ? -4 : 12)];
       context.strokeText(...label);
       context.fillText(...label);
@@ -229,7 +232,9 @@ class Explorer {
   take(kind, message, buffers = []) {
     const bytes = (i) => new Uint8Array(buffers[i].buffer, buffers[i].byteOffset, buffers[i].byteLength);
     const copy = (i, Type) => new Type(bytes(i).slice().buffer);
-    this.say(message.error ?? message.progress ?? "", kind === "error");
+    const text = message.error ?? message.progress ?? "";
+    // An error stays while the pointer moves.
+    if (text || kind !== "probe" || !this.message.matches(".dbt-wrong")) this.say(text, kind === "error");
     ({
       start: () => this.panes || this.build(message, copy),
       frames: () => {
@@ -253,7 +258,11 @@ class Explorer {
     })[kind]?.();
     if (this.panes) this.redraw(kind === "frames" ? [] : undefined);
   }
-  say(text, wrong = false) { this.message.textContent = text || HELP; this.message.classList.toggle("dbt-wrong", wrong); }
+  say(text, wrong = false) {
+    this.message.textContent = text || HELP;
+    this.message.classList.toggle("dbt-wrong", wrong);
+    if (wrong) this.message.scrollIntoView({ block: "nearest" }); // it lies below all pictures
+  }
 
   // The page
   build({ regions, palettes, ...setup }, copy) {
@@ -368,6 +377,7 @@ class Explorer {
   showText(value) {
     const dialog = make(this.root, "div", "dbt-dialog");
     make(dialog, "textarea", "", { value, readOnly: true, rows: value.split("\n").length }).select();
+    dialog.scrollIntoView({ block: "nearest" });
     navigator.clipboard?.writeText(value).then(() => this.say("copied"), () => this.say("select and copy"));
     this.button(dialog, "Close", "", () => dialog.remove());
   }
@@ -405,7 +415,7 @@ class Explorer {
     for (const button of this.tools) button.classList.toggle("dbt-chosen", button.dataset.tool === tool);
   }
   choose(pane) {
-    if (pane.kind !== "status") this.chosen = pane.name;
+    this.chosen = pane.name;
     this.askCurves();
     this.askProfile();
   }
@@ -598,8 +608,8 @@ class Explorer {
     const ink = getComputedStyle(this.root).color;
     Object.assign(context, { font: "12px sans-serif", fillStyle: ink });
     this.axes = regions.length ? [64, width - 12] : null;
-    if (!this.axes) return context.fillText("Rectangle, Ellipse or Polygon: draw a region in a picture to see its curve here.", 12, 24);
-    const ends = regions.flatMap(([, , { low, high }]) => this.time.flatMap((_, i) => [low(i), high(i)])).filter(Number.isFinite);
+    if (!this.axes) return context.fillText("Rectangle, Ellipse or Polygon: draw a region in a picture to see its curve here.", 12, 24, width - 24);
+    const ends = regions.flatMap(([, , curve]) => this.time.flatMap((_, i) => [curve.low(i), curve.high(i), ...interval(curve, i)])).filter(Number.isFinite);
     const range = ends.length ? [ends.reduce((a, b) => Math.min(a, b)), ends.reduce((a, b) => Math.max(a, b))] : [0, 1];
     const margin = Math.max(0.06 * (range[1] - range[0]), 1e-3);
     const [low, high] = [range[0] - margin, range[1] + margin];
@@ -645,14 +655,16 @@ class Explorer {
     context.scale(devicePixelRatio, devicePixelRatio);
     Object.assign(context, { font: "12px sans-serif", fillStyle: getComputedStyle(this.root).color, strokeStyle: "#8884" });
     const finite = values.filter(Number.isFinite), [from, to] = line.points;
-    context.fillText(`${capital(pane.label)} along the line ${this.shownUnit(pane) && `[${this.shownUnit(pane)}]`}`, left, 12);
+    context.fillText(`${this.pictures.get(pane.name).title.textContent} along the line ${this.shownUnit(pane) && `[${this.shownUnit(pane)}]`}`, left, 12);
     if (!finite.length) return;
     const length = Math.hypot(to[0] - from[0], to[1] - from[1]), margin = Math.max(0.06 * (Math.max(...finite) - Math.min(...finite)), 1e-3);
     const [low, high] = [Math.min(...finite) - margin, Math.max(...finite) + margin];
     const across = (at) => left + (at / length) * (right - left), down = (value) => bottom - ((value - low) / (high - low)) * (bottom - top);
-    for (const [at, text] of ticks(low, high, (bottom - top) / 30)) { context.fillText(text, 8, down(at) + 4); context.stroke(new Path2D(`M${left} ${down(at)}H${right}`)); }
-    for (const [at, text] of ticks(0, length, (right - left) / 90)) { context.fillText(text, across(at) - 4, bottom + 14); context.stroke(new Path2D(`M${across(at)} ${top}V${bottom}`)); }
-    context.fillText("distance [pixel]", (left + right) / 2 - 40, height - 4);
+    context.textAlign = "right";
+    for (const [at, text] of ticks(low, high, (bottom - top) / 30)) { context.fillText(text, left - 6, down(at) + 4); context.stroke(new Path2D(`M${left} ${down(at)}H${right}`)); }
+    context.textAlign = "center";
+    for (const [at, text] of ticks(0, length, (right - left) / 90)) { context.fillText(text, across(at), bottom + 14); context.stroke(new Path2D(`M${across(at)} ${top}V${bottom}`)); }
+    context.fillText("distance [pixel]", (left + right) / 2, height - 4);
     Object.assign(context, { strokeStyle: this.colors[0], lineWidth: 2 });
     const point = (value, i) => `${across((length * i) / (values.length - 1))} ${down(value)}`;
     context.stroke(new Path2D(values.map((value, i) => (Number.isFinite(value) ? `${i && Number.isFinite(values[i - 1]) ? "L" : "M"}${point(value, i)}` : "")).join("")));
@@ -660,11 +672,10 @@ class Explorer {
   drawCurve(context, color, { mean, low, high, std }, across, down) {
     const point = (i, value) => `${across(i)} ${down(value)}`;
     const runs = this.time.map((_, i) => i).filter((i) => Number.isFinite(mean(i)));
+    const corners = (i) => [[i, 1], [i + 1, 1], [i + 1, 0], [i, 0]].map(([at, end]) => point(at, interval({ mean, std }, at)[end]));
+    const steps = runs.filter((i) => i + 1 < this.time.length && Number.isFinite(std(i) + std(i + 1)));
     context.fillStyle = `${color}44`;
-    for (const i of runs.filter((at) => at + 1 < this.time.length && Number.isFinite(std(at) + std(at + 1)))) {
-      const corners = [[i, 1], [i + 1, 1], [i + 1, -1], [i, -1]].map(([at, sign]) => point(at, mean(at) + sign * 1.96 * std(at)));
-      context.fill(new Path2D(`M${corners.join("L")}Z`));
-    }
+    context.fill(new Path2D(steps.map((i) => `M${corners(i).join("L")}Z`).join(""))); // at once: without seams
     for (const [value, lineWidth, dashes] of [[low, 1, [2, 3]], [high, 1, [2, 3]], [mean, 2, []]]) {
       Object.assign(context, { strokeStyle: color, lineWidth });
       context.setLineDash(dashes);

@@ -62,6 +62,8 @@ SIDES = """async (level) => {
     return Array.from(picture.sides);
 }"""
 
+BEYOND = f"{EXPLORER}.plot.getContext('2d').getImageData(70, 0, 300, 11).data.some(Boolean)"
+
 
 class Lab:
     """JupyterLab on a free port in a folder, and a page of a browser that reaches nothing else."""
@@ -233,6 +235,14 @@ def check_tools(page: Any, view: View, region: Region, index: int) -> None:
         page.get_by_role("button", name="GIF").click()
     with Image.open(download.value.path()) as film:
         assert film.n_frames == view.time.size  # type: ignore[attr-defined]
+    # The interval of an emissivity lies within the axes.
+    titles = page.locator(".dbt-title:enabled")
+    titles.get_by_text("9.5 \N{MICRO SIGN}m emissivity").click()
+    page.wait_for_function(
+        f"{EXPLORER}.plotted.name === 'emissivity 9.5' && !{EXPLORER}.changed.size"
+    )
+    assert not page.evaluate(BEYOND)
+    titles.get_by_text("Object temperature", exact=True).click()
     # A second region, less the first.
     page.locator("[data-tool=rectangle]").click()
     drag(page, canvas, (0.7, 0.4), (0.9, 0.8))
@@ -245,6 +255,21 @@ def check_tools(page: Any, view: View, region: Region, index: int) -> None:
         for number in left:
             page.keyboard.press(key)
             assert page.evaluate(f"{EXPLORER}.regions.size") == number
+
+
+def check_narrow(page: Any) -> None:
+    """In a narrow page all is within; an error is seen, and stays while the pointer moves."""
+    page.set_viewport_size({"width": 550, "height": 500})
+    explorer, error = page.locator("[data-testid=explorer]"), page.locator(".dbt-wrong")
+    assert explorer.evaluate("it => it.scrollWidth <= it.clientWidth")
+    page.get_by_role("button", name="CSV").click()
+    box = error.bounding_box()
+    assert box is not None
+    assert 0 < box["y"] < 500 - box["height"]
+    page.evaluate(f"{EXPLORER}.probed = null")
+    page.locator("canvas[data-pane=object_temperature]").hover()
+    page.wait_for_function(f"{EXPLORER}.probed")
+    assert "Must have one: draw it first" in error.inner_text()
 
 
 def test_region_is_dragged_and_its_curve_read_back(lab: Lab, page: Any) -> None:
@@ -283,6 +308,7 @@ def test_region_is_dragged_and_its_curve_read_back(lab: Lab, page: Any) -> None:
     check_tools(page, view, after, start + 11)
     if folder := os.environ.get("DBTHERMAL_SCREENSHOTS"):
         page.locator("[data-testid=explorer]").screenshot(path=f"{folder}/explorer.png")
+    check_narrow(page)
     assert (lab.outside, lab.errors) == ([], [])
 
 
