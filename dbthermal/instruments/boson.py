@@ -184,25 +184,20 @@ class Decoder:
 
     def __init__(self) -> None:
         self.damaged = 0  # dropped frames: cut, too long or short, wrong escape or checksum
-        self._content: bytes | None = None  # since the last start byte; None between frames
-
-    @property
-    def is_open(self) -> bool:
-        """True if a frame has begun and not yet ended."""
-        return self._content is not None
+        self.pending: bytes | None = None  # since the last start byte; None between frames
 
     def feed(self, received: bytes) -> list[Packet]:
         """Take in any number of bytes; return the undamaged frames that they complete."""
         frames = []
         for number, piece in enumerate(bytes(received).split(_START)):
             if number:  # a start byte came before it, and begins anew
-                self.damaged += self.is_open
-                self._content = b""
-            if self._content is None:
+                self.damaged += self.pending is not None
+                self.pending = b""
+            if self.pending is None:
                 continue
-            self._content, end, _ = (self._content + piece).partition(_END)
-            if end or len(self._content) > 2 * MAXIMUM_FRAME:  # each byte may be escaped
-                frame, self._content = _frame(self._content), None
+            self.pending, end, _ = (self.pending + piece).partition(_END)
+            if end or len(self.pending) > 2 * MAXIMUM_FRAME:  # each byte may be escaped
+                frame, self.pending = _frame(self.pending), None
                 frames += [frame] if frame else []
                 self.damaged += frame is None
         return frames
