@@ -145,8 +145,6 @@ def _truth(scene: xr.Dataset, *, resting: bool) -> _fisher.Truth:
     temperature, background, emissivity = (
         scene[name].values.astype(np.float64).reshape(scene[name].shape[0], -1) for name in names
     )
-    for name, values in zip(names[:2], (temperature, background), strict=True):
-        schema.require_measured(values, f"{name} of the scene")
     if len(emissivity) < 2:
         raise ValueError("Invalid scene of one band. Must have at least two.")
     _require_fractions(scene["emissivity"])

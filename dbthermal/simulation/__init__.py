@@ -396,7 +396,6 @@ def observe(
     schema.check(scene, "separated", ("object_temperature", "emissivity"), "the scene")
     background: Any = scene.get("background_temperature")
     schema.check_numbers(background, "'background_temperature' of the scene", "K")
-    _numbers.real_numbers("emissivity of the scene", scene["emissivity"].values, (0.0, 1.0))
     schema.check(response, "response", ("noise",))
     names = [str(name) for name in response["band"].values]
     emitted = _blackbody(response, scene["object_temperature"])

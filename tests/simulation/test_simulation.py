@@ -201,7 +201,7 @@ test_what_is_not_recorded = refused(
     lambda made, call: call(made),
     [
         (warmer, "the response's range"),
-        (lambda m: m.seen(emissivity=100 * m.twin["emissivity"]), "emissivity of the scene 86"),
+        (lambda m: m.seen(emissivity=100 * m.twin["emissivity"]), "Invalid emissivity 86"),
         (lambda m: observe(m.twin.isel(band=[0]), KNOWN, m.rng), "Missing band '9.5' in the scene"),
         (lambda m: observe(m.twin[["emissivity"]], KNOWN, m.rng), "'object_temperature'"),
         (lambda m: observe(m.twin, KELVIN, m.rng), "Invalid units 'K' of 'noise'"),
