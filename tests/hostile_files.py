@@ -43,6 +43,12 @@ def seed_of_week() -> int:
     return int(os.environ.get("DBTHERMAL_SEED") or 100 * year + week)
 
 
+def written(path: Path, content: bytes) -> Path:
+    """File of a content."""
+    path.write_bytes(content)
+    return path
+
+
 def write(path: Path, form: str) -> Path:
     """Recording of a form, undamaged: a file, or the folder of a store."""
     if form == "jpg":

@@ -10,7 +10,9 @@ import imagecodecs
 import numpy as np
 import pytest
 from flir_files import CONSTANTS, compressed, jpeg, scene, sequence
+from hostile_files import written
 from numpy.testing import assert_allclose, assert_array_equal
+from refused import refused
 
 from dbthermal import readers, schema
 
@@ -320,8 +322,8 @@ def test_parts_of_a_recording(path: Path) -> None:
         readers.flir(path, frames=slice(-1, None))
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "rule"),
+test_refused_with_what_to_do = refused(
+    lambda folder, name, content: readers.flir(written(folder / name, content)),
     [
         ("a.ats", b"", "readers.tiff"),
         ("a.mp4", b"\0\0\0\x18ftypmp42", "film: most have 8 bits that are drawn.*gray16le"),
@@ -334,12 +336,9 @@ def test_parts_of_a_recording(path: Path) -> None:
         ("a.jpg", b"\xff\xd8\xff\xda\0\2", "No thermal data of FLIR .* of another maker"),
         ("a.jpg", b"\xff\xd8\xff\xe1\xff\xff", "Damaged JPEG"),
     ],
+    "tmp_path",
+    ValueError,
 )
-def test_refused_with_what_to_do(tmp_path: Path, name: str, content: bytes, rule: str) -> None:
-    """What is no FLIR recording says what it is, and what to do instead."""
-    (tmp_path / name).write_bytes(content)
-    with pytest.raises(ValueError, match=rule):
-        readers.flir(tmp_path / name)
 
 
 def test_size_before_memory(path: Path) -> None:

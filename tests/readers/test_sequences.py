@@ -7,17 +7,12 @@ import numpy as np
 import pytest
 import xarray as xr
 from flir_files import scene
-from hostile_files import hcc, sfmov
+from hostile_files import hcc, sfmov, written
 from numpy.testing import assert_array_equal
+from refused import refused
 
 from dbthermal import readers
 from dbthermal.__main__ import main
-
-
-def written(path: Path, content: bytes) -> Path:
-    """File of a content."""
-    path.write_bytes(content)
-    return path
 
 
 @pytest.mark.parametrize("ending", ["\r\n", "\n", "", f"{' ' * 69}\r\n"], ids=len)
@@ -48,8 +43,8 @@ def test_hcc(tmp_path: Path) -> None:
         readers.sequence(path)
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "rule"),
+test_refused_by_rule = refused(
+    lambda folder, name, content: readers.sequence(written(folder / name, content), clock=10.0),
     [
         ("a.sfmov", sfmov(scene())[:-5], r"Truncated or damaged: .* with header="),
         ("a.sfmov", sfmov(scene()) + b"1234", r"Truncated or damaged"),
@@ -66,11 +61,9 @@ def test_hcc(tmp_path: Path) -> None:
         ("a.hcc", hcc(scene()).replace(b"TC", b"XX", 2).replace(b"XX", b"TC", 1), "signature of"),
         ("a.hcc", b"II*\0" * 99, r"Must be read by readers\.tiff"),
     ],
+    "tmp_path",
+    ValueError,
 )
-def test_refused_by_rule(tmp_path: Path, name: str, content: bytes, rule: str) -> None:
-    """Truncated, empty, mixed up, or of other numbers: refused, and never read as counts."""
-    with pytest.raises(ValueError, match=rule):
-        readers.sequence(written(tmp_path / name, content), clock=10.0)
 
 
 def test_by_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
