@@ -20,7 +20,8 @@ from matplotlib import colormaps
 from numpy.typing import NDArray
 from scipy.io import savemat
 
-from dbthermal import readers
+from dbthermal import readers, store
+from dbthermal.schema import Variable
 
 COUNTS: Final = flir_files.scene()
 """Counts (time, y, x) of every recording."""
@@ -35,6 +36,21 @@ STORES: Final = {"zarr2": 2, "zarr3": 3}
 SEQUENCES: Final = ("sfmov", "hcc")
 FILES: Final = (*FLIR, *TIFF, *SEQUENCES, "raw", "npy", "npz", "nc", "h5", "mat")
 """Forms of a recording in a single file."""
+
+
+def hdf5_chunk(
+    path: Path, chunk: bytes, filters: dict[int, tuple[int, ...]], *repeated: int, **options: Any
+) -> Path:
+    """HDF5 of `COUNTS` in one chunk, as it is stored, by filters, of which some are there twice."""
+    with h5py.File(path, "w") as file:
+        form = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        form.set_chunk(options.get("chunks", COUNTS.shape))
+        for code in (*filters, *repeated):
+            form.set_filter(code, 1, filters[code])
+        space = h5py.h5s.create_simple(COUNTS.shape, (h5py.h5s.UNLIMITED,) * 3)
+        array = h5py.h5d.create(file.id, b"frames", h5py.h5t.STD_U16LE, space, form)
+        array.write_direct_chunk((0, 0, 0), chunk)
+    return path
 
 
 def seed_of_week() -> int:
@@ -157,6 +173,32 @@ def damaged(content: bytes, seed: int) -> tuple[str, bytes]:
         first, second = changed[place : place + size], changed[other : other + size]
         changed[place : place + size], changed[other : other + size] = second, first
     return kind, bytes(changed)
+
+
+VARIABLES: Final = {
+    "counts": Variable(("band", "time", "y", "x"), "uint16", "count", "raw counts"),
+    "exposure_time": Variable(("band", "time"), "float64", "s", "time of exposure"),
+    "log_time": Variable(("log",), "float64", "s", "time of a note"),
+    "log_value": Variable(("log",), "float64", "1", "value of a note"),
+}
+
+
+def record(path: Path, *, close: bool) -> store.Recording:
+    """Two bands in chunks of two frames, the second one frame behind, zeros among them."""
+    rng = np.random.default_rng(1)
+    sizes = {"y": 3, "x": 4}
+    recording = store.Recording(path, VARIABLES, sizes, ["8-14", "9.5"], chunk=2, attrs={"a": "b"})
+    for start in range(0, 6, 2):
+        for band, number in (("8-14", 2), ("9.5", 2 if start < 4 else 1)):
+            counts = rng.integers(0, 60000 * (start > 0) + 1, (number, 3, 4)).astype("uint16")
+            times = start / 60 + np.arange(number) / 60
+            recording.append(band, {"counts": counts, "exposure_time": times})
+        rows = {"log_time": np.array([start / 60]), "log_value": np.array([0.0])}
+        recording.append_log(rows)
+        recording.commit()
+    if close:
+        recording.close(time=np.arange(6) / 60)
+    return recording
 
 
 HEADER = """Name: Plate  Glass

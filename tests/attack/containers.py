@@ -16,7 +16,7 @@ import numpy as np
 import tifffile
 import xarray as xr
 import zarr
-from scipy.io import netcdf_file
+from hostile_files import COUNTS, hdf5_chunk
 from zarr.codecs import BytesCodec, GzipCodec, ShardingCodec
 
 from attack.damage import Rng
@@ -25,8 +25,6 @@ from attack.oracle import Attack, Verdict, wrong
 from attack.scenes import pick
 from dbthermal import readers
 
-COUNTS: Final = flir_files.scene()
-"""Counts (time, y, x) of every file that is not damaged."""
 _CHUNKED: Final = (1, *COUNTS.shape[1:])
 
 
@@ -41,26 +39,14 @@ def _megabytes(rng: Rng) -> int:
     return int(2 ** rng.uniform(6, 13))
 
 
-def _hdf5(path: Path, chunk: bytes, filters: dict[int, tuple[int, ...]]) -> None:
-    """HDF5 of one chunk, as it is stored, with filters by their codes."""
-    with h5py.File(path, "w") as file:
-        form = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-        form.set_chunk(COUNTS.shape)
-        for code, values in filters.items():
-            form.set_filter(code, 1, values)
-        space = h5py.h5s.create_simple(COUNTS.shape)
-        array = h5py.h5d.create(file.id, b"frames", h5py.h5t.STD_U16LE, space, form)
-        array.write_direct_chunk((0, 0, 0), chunk)
-
-
 def _hdf5_chunk(rng: Rng, path: Path) -> None:
     """A chunk that unpacks farther than it should, or whose filter states another size."""
     way = pick(rng, ["deflate", "lzf", "offset"])
     if way == "deflate":
-        _hdf5(path, _zeros(_megabytes(rng)), pick(rng, [{1: (6,)}, {2: (2,), 1: (6,)}]))
+        hdf5_chunk(path, _zeros(_megabytes(rng)), pick(rng, [{1: (6,)}, {2: (2,), 1: (6,)}]))
     if way == "lzf":  # a literal, then repetitions of 264 bytes by 3
         packed = b"\x00\x00" + b"\xe0\xff\x00" * int(2 ** rng.uniform(14, 21))
-        _hdf5(path, packed, {32000: (4, 0x0105, int(pick(rng, [4, COUNTS.nbytes])))})
+        hdf5_chunk(path, packed, {32000: (4, 0x0105, int(pick(rng, [4, COUNTS.nbytes])))})
     if way == "offset":
         constant = np.full_like(COUNTS, 18000)
         with h5py.File(path, "w") as file:
@@ -219,24 +205,11 @@ def _blocks(change: Callable[[Any], Any]) -> Callable[[Rng, Path], Any]:
     return lambda *_: blocks.map_blocks(change, dtype="u2", meta=np.empty((0, 0, 0), "u2"))
 
 
-def _records(rng: Rng, path: Path) -> Path:
-    """NetCDF 3 whose number of records is another one."""
-    with netcdf_file(path := path.with_suffix(".nc"), "w") as file:
-        for name, size in zip(("time", *"yx"), (None, *COUNTS.shape[1:]), strict=True):
-            file.createDimension(name, size)
-        frames = file.createVariable("frames", "i2", ("time", "y", "x"))
-        frames[:], frames._Unsigned = COUNTS.astype("i2"), "true"
-    number = pick(rng, [0, 1, 2, 4, 2**31])
-    path.write_bytes(path.read_bytes()[:4] + struct.pack(">I", number) + path.read_bytes()[8:])
-    return path
-
-
 def _short(rng: Rng, path: Path) -> Path:
     """HDF5 whose chunk has fewer numbers than it should."""
     part = COUNTS.tobytes()[: int(rng.integers(2, COUNTS.nbytes))]
     packed = pick(rng, [(part, {}), (part, {2: (2,)}), (zlib.compress(part), {1: (6,)})])
-    _hdf5(path := path.with_suffix(".h5"), *packed)
-    return path
+    return hdf5_chunk(path.with_suffix(".h5"), *packed)
 
 
 def _stored(options: dict[str, Any], times: Any = None, **attrs: Any) -> Callable[..., Path]:
@@ -259,7 +232,6 @@ FALSE: Final[dict[str, Callable[[Rng, Path], Any]]] = {
     "blocks in another order of bytes": _blocks(lambda block: block.astype(">u2")),
     "blocks of another size": _blocks(lambda block: block[:, 1:]),
     "masked blocks": _blocks(lambda block: np.ma.masked_greater(block, 18100)),
-    "records of NetCDF": _records,
     "a short chunk": _short,
     "a fill value that is there": _stored({}, _FillValue=COUNTS[1, 2, 3]),
     "a scale of NaN": _stored({}, Scale_Factor=np.nan),

@@ -15,11 +15,12 @@ from typing import Any, Final
 import numpy as np
 import xarray as xr
 import zarr
+from hostile_files import record
 
 from attack.damage import Rng, Table, hurt
 from attack.oracle import Attack, Verdict, wrong
 from attack.scenes import pick, scene
-from dbthermal import readers, schema, store
+from dbthermal import readers, store
 from dbthermal.instruments.recording import open_capture
 from reproduction import numbers
 
@@ -35,25 +36,7 @@ def originals() -> Path:
     folder, made = Path(_workplace().name) / "whole", _made(1)
     capture = made.assign(note=((), "a text")).assign_attrs(title="x" * 40)
     store.save(capture, folder / "result.zarr", store.provenance({"seed": 1}))
-    counts, bands = schema.STAGES["capture"]["counts"], ["8-14", "9.5"]
-    flags = schema.Variable(("band", "time"), "uint16", "1", "flags")
-    stamps = schema.Variable(("band", "time"), "float64", "s", "when")
-    log = {n: schema.Variable(("log",), "float64", "1", n) for n in ("log_time", "log_value")}
-    variables = {"counts": counts, "frame_flags": flags, "exposure_time": stamps, **log}
-    path = folder / "recording.zarr"
-    recording = store.Recording(path, variables, {"y": 16, "x": 20}, bands, chunk=10, attrs={})
-    for first in range(0, 40, 10):
-        block = made.isel(time=slice(first, first + 10))
-        for place, band in enumerate(bands):
-            frames: dict[str, Any] = {
-                "counts": block["counts"].values[place].astype(np.uint16),
-                "frame_flags": np.zeros(10, np.uint16),
-                "exposure_time": block["time"].values,
-            }
-            recording.append(band, frames)
-        recording.append_log({"log_time": np.arange(3.0), "log_value": np.ones(3)})
-        recording.commit()
-    recording.close(time=made["time"].values[:40])
+    record(folder / "recording.zarr", close=True)
     numbers.save({"rmse_K": 0.21, "name": "a"}, folder / "numbers.json", {"seed": 1})
     foreign = made["counts"].values[0, :8].astype(np.uint16)
     for name, layers in (("foreign", None), ("shards", (4, 16, 20))):

@@ -20,7 +20,7 @@ import pytest
 import xarray as xr
 import zarr
 from flir_files import scene
-from hostile_files import write
+from hostile_files import hdf5_chunk, write
 from numpy.testing import assert_allclose, assert_array_equal
 from refused import refused
 from scipy.io import savemat
@@ -530,32 +530,18 @@ def test_matlab_5(tmp_path: Path, *, packed: bool) -> None:
             read(path)
 
 
-def chunked(path: Path, chunk: bytes, filters: dict[int, tuple[int, ...]], **options: Any) -> Path:
-    """HDF5 of one chunk, as it is stored, by filters."""
-    with h5py.File(path, "w") as file:
-        form = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-        form.set_chunk(options.get("chunks", scene().shape))
-        for code, values in filters.items():
-            form.set_filter(code % 1000 if code < 10**6 else code // 1000, 1, values)
-        limits = (h5py.h5s.UNLIMITED,) * 3
-        space = h5py.h5s.create_simple(scene().shape, limits)
-        array = h5py.h5d.create(file.id, b"frames", h5py.h5t.STD_U16LE, space, form)
-        array.write_direct_chunk((0, 0, 0), chunk)
-    return path
-
-
 def test_filters_of_hdf5(tmp_path: Path) -> None:
     """A filter that is missing is named; deflate may come once, last, and unpacks to its chunk."""
     path, values = tmp_path / "a.h5", scene().tobytes()
-    assert_array_equal(read(chunked(path, zlib.compress(values), {1: (6,)})).counts, scene())
+    assert_array_equal(read(hdf5_chunk(path, zlib.compress(values), {1: (6,)})).counts, scene())
     with pytest.raises(ValueError, match=r"Missing filter 32001, .*python -m pip install hdf5plug"):
-        read(chunked(path, values, {32001000: ()}))
+        read(hdf5_chunk(path, values, {32001: ()}))
     with pytest.raises(ValueError, match=r"^Invalid filters \[1, 1\] .* Must be shuffle, then"):
-        read(chunked(path, zlib.compress(zlib.compress(values)), {1: (6,), 1001: (6,)}))
+        read(hdf5_chunk(path, zlib.compress(zlib.compress(values)), {1: (6,)}, 1))
     with pytest.raises(ValueError, match=r"Invalid chunk of 'frames' .* Must unpack to 4608"):
-        read(chunked(path, zlib.compress(values + bytes(10**8)), {1: (6,)}))
+        read(hdf5_chunk(path, zlib.compress(values + bytes(10**8)), {1: (6,)}))
     with pytest.raises(ValueError, match="Invalid chunk of 800000000 bytes of 'frames'"):
-        read(chunked(path, b"x", {1: (6,)}, chunks=(400, 1000, 1000)))
+        read(hdf5_chunk(path, b"x", {1: (6,)}, chunks=(400, 1000, 1000)))
 
 
 def test_chunks_are_not_too_many(tmp_path: Path) -> None:

@@ -10,35 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from hostile_files import record
 
 from dbthermal import store
-from dbthermal.schema import Variable
 
 KINDS = ("result", "recording", "cut short")
-VARIABLES = {
-    "counts": Variable(("band", "time", "y", "x"), "uint16", "count", "raw counts"),
-    "exposure_time": Variable(("band", "time"), "float64", "s", "time of exposure"),
-    "log_time": Variable(("log",), "float64", "s", "time of a note"),
-    "log_value": Variable(("log",), "float64", "1", "value of a note"),
-}
-
-
-def record(path: Path, *, close: bool) -> store.Recording:
-    """Two bands in chunks of two frames, the second one frame behind, zeros among them."""
-    rng = np.random.default_rng(1)
-    sizes = {"y": 3, "x": 4}
-    recording = store.Recording(path, VARIABLES, sizes, ["8-14", "9.5"], chunk=2, attrs={"a": "b"})
-    for start in range(0, 6, 2):
-        for band, number in (("8-14", 2), ("9.5", 2 if start < 4 else 1)):
-            counts = rng.integers(0, 60000 * (start > 0) + 1, (number, 3, 4)).astype("uint16")
-            times = start / 60 + np.arange(number) / 60
-            recording.append(band, {"counts": counts, "exposure_time": times})
-        rows = {"log_time": np.array([start / 60]), "log_value": np.array([0.0])}
-        recording.append_log(rows)
-        recording.commit()
-    if close:
-        recording.close(time=np.arange(6) / 60)
-    return recording
 
 
 @pytest.fixture(scope="module")
