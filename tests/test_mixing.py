@@ -47,12 +47,12 @@ def test_matrix_mixes() -> None:
     np.testing.assert_allclose(mixed, mixing.leaving(emissivity, 320.0, 290.0), rtol=0, atol=1e-10)
 
 
-@given(FRACTIONS, FRACTIONS)
-def test_condition_number_against_numpy(first: float, second: float) -> None:
+@given(st.lists(FRACTIONS, min_size=2, max_size=4))
+def test_condition_number_against_numpy(bands: list[float]) -> None:
     """The closed form is `numpy.linalg.cond` unless the matrix is nearly singular."""
-    assume(abs(first - second) > 1e-6)
-    expected = float(np.linalg.cond(mixing.matrix([first, second])))
-    assert float(mixing.condition_number([first, second])) == pytest.approx(expected, rel=1e-9)
+    assume(np.ptp(bands) > 1e-6)
+    expected = float(np.linalg.cond(mixing.matrix(bands)))
+    assert float(mixing.condition_number(bands)) == pytest.approx(expected, rel=1e-9)
 
 
 def test_extremes_of_the_condition_number() -> None:
@@ -60,11 +60,6 @@ def test_extremes_of_the_condition_number() -> None:
     numbers = mixing.condition_number([[1.0, 0.0], [0.9, 0.9], [0.0, 0.0]])
     np.testing.assert_array_equal(numbers, [1.0, np.inf, np.inf])
     assert float(mixing.condition_number([0.86, 0.72])) == pytest.approx(9.58, abs=0.005)
-
-
-def test_third_band_helps() -> None:
-    """The number of three bands uses all of them: one that differs saves a gray pair."""
-    assert float(mixing.condition_number([0.9, 0.9, 0.5])) < 10.0
 
 
 @pytest.mark.parametrize("emissivity", [-0.1, 1.2, np.nan])

@@ -11,6 +11,7 @@ import tifffile
 import xarray as xr
 import zarr
 from flir_files import scene, sequence
+from hostile_files import hcc, sfmov
 
 from dbthermal import readers
 from dbthermal.__main__ import main
@@ -26,17 +27,32 @@ def info(capsys: pytest.CaptureFixture[str], *words: Any) -> tuple[int, str]:
 
 
 def test_commands_read_by_first_bytes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """HDF5, TIFF, PNG and FLIR of any name open by the same command."""
+    """HDF5, TIFF, PNG, FLIR, Telops and zarr of any name open by one command, with their times."""
     with h5py.File(tmp_path / "a.hdf", "w") as file:
         file["frames"] = scene()
     tifffile.imwrite(tmp_path / "a.dat", scene(), photometric="minisblack")
     (tmp_path / "a1.bin").write_bytes(imagecodecs.png_encode(scene()[0]))
-    for name in ("a.hdf", "a.dat", "a1.bin"):
-        status, text = info(capsys, tmp_path / name, *STATED)
-        assert status == 0, text
-        assert "stage: recording" in text
     (tmp_path / "b.bin").write_bytes(sequence(scene()))
-    assert info(capsys, tmp_path / "b.bin")[0] == 0
+    (tmp_path / "b.hcc").write_bytes(hcc(scene()))
+    (tmp_path / "b.sfmov").write_bytes(sfmov(scene()))
+    zarr.create_array(tmp_path / "a.zarr", data=scene())
+    film = xr.DataArray(scene(), dims=("time", "y", "x"), name="frames")
+    moments = np.datetime64("2026-01-01", "ns") + np.arange(3) * np.timedelta64(100, "ms")
+    film = film.assign_coords(time=moments)
+    film.to_dataset().to_zarr(tmp_path / "b.zarr", zarr_format=3, consolidated=False)
+    for name, stated, words in (
+        ("a.hdf", STATED, "stage: recording"),
+        ("a.dat", STATED, "stage: recording"),
+        ("a1.bin", STATED, "stage: recording"),
+        ("b.bin", (), "stage: recording"),
+        ("b.hcc", (), "frame_rate_Hz: 10.0"),
+        ("b.sfmov", (), "clock: not in the file"),
+        ("a.zarr", (), "clock: not in the file"),
+        ("b.zarr", (), "frame_rate_Hz: 10.0"),
+    ):
+        status, text = info(capsys, tmp_path / name, *stated)
+        assert status == 0, text
+        assert words in text
 
 
 @pytest.mark.parametrize("name", ["a.raw", "a.bin", "a", "a.dat"])
@@ -94,25 +110,13 @@ def test_texts_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str], nam
             assert (status, f"Refused '{name}', a text" in text) == (1, True)
 
 
-def test_zarr_of_other_programs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """An array or group of zarr that dbthermal has not saved is a recording, with its times."""
-    zarr.create_array(tmp_path / "a.zarr", data=scene())
-    film = xr.DataArray(scene(), dims=("time", "y", "x"), name="frames")
-    moments = np.datetime64("2026-01-01", "ns") + np.arange(3) * np.timedelta64(100, "ms")
-    film = film.assign_coords(time=moments)
-    film.to_dataset().to_zarr(tmp_path / "b.zarr", zarr_format=3, consolidated=False)
-    for name, words in (("a.zarr", "clock: not in the file"), ("b.zarr", "frame_rate_Hz: 10.0")):
-        status, text = info(capsys, tmp_path / name)
-        assert status == 0
-        assert words in text
-
-
 def test_another_reader_is_named(tmp_path: Path) -> None:
     """A file of a format that another reader opens says which; a folder is named by its files."""
     with pytest.raises(ValueError, match=r"Invalid folder .* Must be files: .*/\*\.tif"):
         readers.tiff(tmp_path, unit="count", clock=10.0)
     np.save(tmp_path / "a.npy", scene())
     (tmp_path / "a.seq").write_bytes(sequence(scene()))
+    (tmp_path / "a.hcc").write_bytes(hcc(scene()))
     tifffile.imwrite(tmp_path / "a.tif", scene(), photometric="minisblack")
     for name, wrong, right in (
         ("a.npy", readers.tiff, "array"),
@@ -121,3 +125,5 @@ def test_another_reader_is_named(tmp_path: Path) -> None:
     ):
         with pytest.raises(ValueError, match=rf"Must be read by readers\.{right}"):
             wrong(tmp_path / name, unit="count", clock=10.0)
+    with pytest.raises(ValueError, match=r"Must be read by readers\.sequence"):
+        readers.flir(tmp_path / "a.hcc")

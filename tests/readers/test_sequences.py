@@ -12,7 +12,6 @@ from numpy.testing import assert_array_equal
 from refused import refused
 
 from dbthermal import readers
-from dbthermal.__main__ import main
 
 
 @pytest.mark.parametrize("ending", ["\r\n", "\n", "", f"{' ' * 69}\r\n"], ids=len)
@@ -64,17 +63,6 @@ test_refused_by_rule = refused(
     "tmp_path",
     ValueError,
 )
-
-
-def test_by_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Commands open both by their suffix, and another reader names this one."""
-    a = written(tmp_path / "a.hcc", hcc(scene()))
-    b = written(tmp_path / "b.sfmov", sfmov(scene()))
-    for path, words in ((a, "frame_rate_Hz: 10.0"), (b, "clock: not in the file")):
-        assert main(["info", str(path)]) == 0
-        assert words in capsys.readouterr().out
-    with pytest.raises(ValueError, match=r"Must be read by readers\.sequence"):
-        readers.flir(a)
 
 
 def bare(path: Path, **options: Any) -> xr.Dataset:
