@@ -304,12 +304,9 @@ def noise(response: xr.Dataset, bands: list[str]) -> Array:
     if "noise" not in schema.check(response, "response"):
         raise ValueError("Missing noise of the response. Must be given to fit_response.")
     places = schema.band_positions(response, bands, "the response")
-    values = np.asarray(response["noise"].values[places], dtype=np.float64)
-    bad = ~((values > 0) & np.isfinite(values))
-    if np.any(bad):
-        label = f"Invalid noise [count] {values[bad][0]} in band '{bands[int(np.argmax(bad))]}'"
-        raise ValueError(f"{label}. Must be finite and positive.")
-    return values
+    values = zip(bands, response["noise"].values[places], strict=True)
+    label, within = "noise [count] in band '{}'", _numbers.POSITIVE
+    return np.array([_numbers.real_number(label.format(band), it, within) for band, it in values])
 
 
 def counts(response: xr.Dataset, temperature: xr.DataArray) -> xr.DataArray:
