@@ -45,6 +45,12 @@ def mirror() -> Path:
     return Path(folder)
 
 
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """Seeded random numbers."""
+    return np.random.default_rng(11)
+
+
 @pytest.fixture(scope="session")
 def shelf(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Shelf:
     """Small scenes and what comes out of them, shared by all workers of the session."""

@@ -21,12 +21,6 @@ Signals = tuple[Array, Array]
 
 
 @pytest.fixture
-def rng() -> np.random.Generator:
-    """Seeded random numbers."""
-    return np.random.default_rng(11)
-
-
-@pytest.fixture
 def white(rng: np.random.Generator) -> Signals:
     """White noise of 0.03 and 0.35 K."""
     first, second = (std * rng.standard_normal((FRAMES, PIXELS)) for std in NOISE)

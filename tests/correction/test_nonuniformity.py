@@ -42,12 +42,6 @@ def centred(gain: object, offset: object) -> xr.Dataset:
 
 
 @pytest.fixture
-def rng() -> np.random.Generator:
-    """Seeded random numbers."""
-    return np.random.default_rng(3)
-
-
-@pytest.fixture
 def ideal(rng: np.random.Generator) -> xr.Dataset:
     """Frames of 12 by 16 good pixels with 3 % of gain, 200 counts of offset and 2 of noise."""
     size = (12, 16)

@@ -206,11 +206,11 @@ def keyboard() -> Iterator[None]:
     signal.signal(signal.SIGINT, before)
 
 
-def interrupt(_: Preview | None = None) -> None:
-    """Interrupt the main thread as the keyboard does."""
+def interrupt(_: Preview | None = None, number: signal.Signals = signal.SIGINT) -> None:
+    """Interrupt the main thread as the keyboard does, or by another signal."""
     main = threading.main_thread().ident
     assert main is not None
-    signal.pthread_kill(main, signal.SIGINT)
+    signal.pthread_kill(main, number)
 
 
 class HastyClock(EmulatedClock):

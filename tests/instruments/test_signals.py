@@ -17,7 +17,7 @@ import pytest
 from file_operations import before_operation, operations_of
 from rig_session import LIMIT, replaced, scene_text
 from test_capture_file import CaptureFile
-from test_record import SMALL, bench, session, written
+from test_record import SMALL, bench, interrupt, session, written
 
 from dbthermal import store
 from dbthermal.instruments.recording import Preview, SignalExit, raised_signals, record
@@ -99,12 +99,10 @@ def test_a_script_ends_whole(
 ) -> None:
     """Called by a script, a recording is closed, whatever comes meanwhile, and the script ends."""
     before, sources, close = [*map(signal.getsignal, ENDING)], bench(), CaptureFile.close
-    main = threading.main_thread().ident
-    assert main is not None
 
     def hit(file: CaptureFile, *, complete: bool, ended: str) -> None:
         for another in (*ENDING, *ENDING):
-            signal.pthread_kill(main, another)
+            interrupt(number=another)
             sources["9.5"].clock.sleep(1.0)  # which lets the main thread look
         close(file, complete=complete, ended=ended)
 
@@ -140,8 +138,6 @@ def test_what_the_program_handles_is_left_alone() -> None:
 @pytest.mark.parametrize("every", [250, pytest.param(40, marks=pytest.mark.slow)])
 def test_signals_at_any_moment(tmp_path: Path, every: int) -> None:
     """Told to end before any file operation, a recording is closed with all its frames."""
-    main = threading.main_thread().ident
-    assert main is not None
 
     def run(path: Path) -> None:
         record(session(0.15), bench(), path, limits=SMALL)
@@ -149,7 +145,7 @@ def test_signals_at_any_moment(tmp_path: Path, every: int) -> None:
     operations = operations_of(lambda: run(tmp_path / "first.zarr"))
     for moment in [*range(1, 60, 7), *range(60, operations, every)]:  # first the empty store
         path, number, ended = tmp_path / f"{moment}.zarr", ENDING[moment % 2], "duration"
-        with before_operation(moment, partial(signal.pthread_kill, main, number)):
+        with before_operation(moment, partial(interrupt, number=number)):
             try:
                 run(path)
             except SignalExit as end:

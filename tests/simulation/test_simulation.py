@@ -39,17 +39,10 @@ class Made:
 
 
 @pytest.fixture
-def made() -> Made:
+def made(rng: np.random.Generator) -> Made:
     """Of one seed."""
-    rng = np.random.default_rng(11)
     detector = simulation.pattern(RIG, SHAPE, rng)
     return Made(rng, simulation.walkers(TIME, SHAPE, GLASS, rng), detector)
-
-
-@pytest.fixture
-def rng() -> np.random.Generator:
-    """Seeded random numbers."""
-    return np.random.default_rng(11)
 
 
 @given(start=st.floats(280.0, 300.0), stop=st.floats(280.0, 340.0), constant=st.floats(1.0, 100.0))
