@@ -204,9 +204,8 @@ def accuracy(
     limits |= {"gain_std": (0.0, 1.0), "background_ratio_std": (0.0, 1.0)}  # relative, not in %
     for name, default in ACCURACY.items():
         value = np.asarray(response.get(name, default), np.float64)
-        stated[name], within = value, limits.get(name, (0.0, schema.LARGEST))
-        if not np.all((value >= within[0]) & (value <= within[1])):
-            _numbers.real_numbers(f"{name} of the response", value, within)  # says which and why
+        within = limits.get(name, (0.0, schema.LARGEST))
+        stated[name] = _numbers.real_numbers(f"{name} of the response", value, within)
     offset, gain, pattern = (
         np.broadcast_to(stated[name], response.sizes["band"])[places]
         for name in ("offset_std", "gain_std", "pattern_std")

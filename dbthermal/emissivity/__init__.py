@@ -234,12 +234,10 @@ def _values(spectrum: xr.Dataset, material: str) -> tuple[Array, Array]:
     emissivity = values.values.astype(np.float64)
     wavelength = values["wavelength"].values.astype(np.float64)
     lowest, highest = schema.EMISSIVITY_LIMITS
-    limits = f"lie in [{lowest}, {highest}]; it is a fraction, not per cent"
-    within = (emissivity >= lowest) & (emissivity <= highest)
-    for bad, rule in ((~np.isfinite(emissivity), "be finite"), (~within, limits)):
-        if bad.any():
-            label = f"{emissivity[bad][0]} of '{material}' at {wavelength[bad][0]} m"
-            raise ValueError(f"Invalid emissivity {label}. Must {rule}.")
+    if (bad := ~((emissivity >= lowest) & (emissivity <= highest))).any():
+        label = f"{emissivity[bad][0]} of '{material}' at {wavelength[bad][0]} m"
+        rule = f"Must lie in [{lowest}, {highest}]; it is a fraction, not per cent"
+        raise ValueError(f"Invalid emissivity {label}. {rule}.")
     return wavelength, emissivity
 
 
