@@ -10,23 +10,23 @@ HOUSE = Path(dbthermal.__file__).parent
 
 # Lines and modules that a room may have. A room that grows takes from another; these only fall.
 BUDGET = {
-    "": (3471, 15),
+    "": (3467, 15),
     "_cli": (1250, 5),
     "alignment": (2861, 10),
     "calibration": (740, 2),
     "correction": (1704, 5),
-    "emissivity": (411, 1),
+    "emissivity": (409, 1),
     "explorer": (1251, 6),
     "figures": (577, 2),
-    "instruments": (5207, 19),
-    "limits": (663, 2),
+    "instruments": (5202, 19),
+    "limits": (661, 2),
     "readers": (2763, 10),
-    "reporting": (363, 1),
+    "reporting": (362, 1),
     "separation": (12766, 48),
-    "simulation": (541, 1),
+    "simulation": (540, 1),
     "store": (1366, 6),
 }
-INSTALLED = 35_879  # lines of all rooms
+INSTALLED = 35_919  # lines of all rooms
 
 PRONOUNS = {
     *("one", "other", "others", "own", "part", "parts", "some", "here", "there", "told", "known"),
