@@ -17,7 +17,7 @@ from dbthermal.instruments.camera import CameraControl, Counts, FrameSource, Ide
 from dbthermal.instruments.filterwheel import BAUDRATE, FilterWheel, NotHomedError
 from dbthermal.instruments.recording import Reading
 from dbthermal.instruments.session import LOGGER, WHEEL, Session
-from dbthermal.instruments.tc08 import TC08
+from dbthermal.instruments.tc08 import TC08, load
 from dbthermal.instruments.transport import SYSTEM, Clock, Transport, open_serial
 
 __all__ = ["Devices", "open_devices"]
@@ -186,11 +186,9 @@ def open_devices(
             wheel.connect()
         # The thermocouples.
         if session.thermocouples:
-            if world is None:
-                logger = TC08.from_url(session.devices[LOGGER])
-            else:
-                logger = TC08(_emulated(".devices").EmulatedTC08(world)).open()
-            stack.enter_context(logger).set_channels(session.thermocouples)
+            library = load() if world is None else _emulated(".devices").EmulatedTC08(world)
+            logger = stack.enter_context(TC08(library).open())
+            logger.set_channels(session.thermocouples)
         yield Devices(session, sources, controls, wheel, logger, world)
 
 

@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dbthermal.instruments.camera import Identity
-from dbthermal.instruments.transport import SYSTEM, Clock, Closing, parse
+from dbthermal.instruments.transport import SYSTEM, Clock, Closing
 
 __all__ = ["ERRORS", "TC08", "ReadingError", "Scan", "TC08Error", "load"]
 __dir__ = __all__.copy
@@ -114,7 +114,7 @@ class Scan(NamedTuple):
 
 
 class TC08(Closing):
-    """A TC-08, opened by `from_url` or `open`; several threads may `read`.
+    """A TC-08, once it is opened; several threads may `read`.
 
     The `library` is from `load`, or an emulated one.
 
@@ -139,12 +139,6 @@ class TC08(Closing):
         self._lock = threading.Lock()
         self._scan: Scan | None = None
         self._used: set[int] = set()  # channels whose value in the scan was given
-
-    @classmethod
-    def from_url(cls, url: str = "tc08:") -> Self:
-        """Load the vendor's library and open the first free unit, at the address ``tc08:``."""
-        parse(url, "tc08")
-        return cls(load()).open()
 
     def open(self, *, timeout: float = OPEN_TIMEOUT) -> Self:
         """Open the first free unit in `timeout` [s]; TimeoutError, OSError or RuntimeError."""

@@ -26,7 +26,7 @@ from dbthermal.instruments.devices import open_devices
 from dbthermal.instruments.emulated import World
 from dbthermal.instruments.emulated.devices import EmulatedApt
 from dbthermal.instruments.filterwheel import FilterWheel
-from dbthermal.instruments.tc08 import TC08
+from dbthermal.instruments.tc08 import TC08, load
 from dbthermal.instruments.transport import TransportError, open_serial
 
 
@@ -76,8 +76,8 @@ def emulated_logger(_: ExitStack) -> Opened:
 
 def real_logger(_: ExitStack) -> Opened:
     """A TC-08 with a type-T thermocouple in socket 1, at room temperature."""
-    url = address("DBTHERMAL_TC08")
-    return Opened(TC08.from_url(url), False, lambda: TC08.from_url(url))
+    assert address("DBTHERMAL_TC08") == "tc08:"
+    return Opened(TC08(load()).open(), False, lambda: TC08(load()).open())
 
 
 def stub_video(_: ExitStack) -> Opened:

@@ -164,22 +164,22 @@ def _good(frames: xr.Dataset, bad: FrameFlag, stamp: str = "device_time") -> Mas
     return np.asarray(np.isfinite(stamps) & ((flags & int(bad)) == 0))
 
 
-def require_whole(folder: str | Path, *, share: float = _WHOLE) -> None:
+def require_whole(folder: str | Path) -> None:
     """ValueError with each recording and band that was cut short or has too few good frames.
 
     Parameters
     ----------
-    folder, share : str or Path, float
-        With recordings, see `overview`; good frames of those promised that a band must have [1].
+    folder : str or Path
+        With recordings, see `overview`; a band must have 95 % of the frames that are promised.
     """
     table = overview(folder)
-    short = table.isel(row=~table["complete"] | (table["good"] < share * table["promised"]))
+    short = table.isel(row=~table["complete"] | (table["good"] < _WHOLE * table["promised"]))
     if cases := [
         f"'{row['recording']}', band '{row['band']}': {row['good']} good frames of "
         f"{row['promised']} promised" + ("" if row["complete"] else ", cut short")
         for row in short.to_dataframe().to_dict("records")
     ]:
-        rule = f"Must have {share:.0%} of them: move these away, and record them again"
+        rule = f"Must have {_WHOLE:.0%} of them: move these away, and record them again"
         raise ValueError(f"Invalid recordings in '{folder}': {'; '.join(cases)}. {rule}.")
 
 
