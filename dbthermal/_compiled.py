@@ -41,7 +41,7 @@ def kept(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Decorator that compiles a function at its first call, and keeps its machine code."""
 
     def decorate(function: Callable[..., Any]) -> Any:
-        result: Any = njit(**options)(function)
+        result: Any = njit(**(options | {"no_cfunc_wrapper": True}))(function)
         if hasattr(result, "py_func"):  # with NUMBA_DISABLE_JIT it is the function itself
             with suppress(RuntimeError):
                 result._cache = cache = _Cache(result)

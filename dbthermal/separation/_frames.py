@@ -124,7 +124,7 @@ def response_tables(tile: Tile) -> tuple[kernels.Table, ...]:
     return tuple(kernels.table(curve, *tile.curves) for curve in tile.curves)
 
 
-@compiled
+@kernels.compiled
 def other_band(
     tables: tuple[kernels.Table, kernels.Table],
     signal: Array,
@@ -198,7 +198,7 @@ def _solve(
         _propagate(parameters[p], shares, at_room, covariance[p], work, result[2:, p])
 
 
-@compiled
+@kernels.compiled
 def _step(
     signal: Array, parameters: Array, share: Array, level: Array, work: _Work, result: Array
 ) -> bool:
@@ -234,7 +234,7 @@ def _step(
     return bool(lacking == 0.0)
 
 
-@compiled
+@kernels.compiled
 def _propagate(
     parameters: Array, shares: Array, at_room: float, covariance: Array, work: _Work, result: Array
 ) -> None:
@@ -263,14 +263,13 @@ def _propagate(
     _add_through(work.of_r, covariance, work.variance, result[2])
 
 
-@compiled
+@kernels.compiled
 def _add_through(sensitivity: Array, covariance: Array, total: Array, result: Array) -> None:
     """Add the variance through parameters, d^T C d, (time) in place."""
     kernels.fill(total, 0.0)
-    for i in range(len(covariance)):
-        for j in range(len(covariance)):
-            for t in range(total.size):
-                total[t] += sensitivity[i, t] * covariance[i, j] * sensitivity[j, t]
+    for i, j in np.ndindex(covariance.shape):
+        for t in range(total.size):
+            total[t] += sensitivity[i, t] * covariance[i, j] * sensitivity[j, t]
     for t in range(total.size):
         result[t] += max(total[t], 0.0)
 

@@ -132,7 +132,7 @@ def absorb(frames: Planes, mean: Planes, top: int, stop: int) -> None:
             second[x] /= count
 
 
-@compiled
+@kernels.compiled
 def _add(first: Any, second: Any, total: Any, second_total: Any, number: Any) -> None:
     """Add a frame's row to the sums, and to the number of samples that are numbers in both."""
     for x in range(first.size):
@@ -142,7 +142,7 @@ def _add(first: Any, second: Any, total: Any, second_total: Any, number: Any) ->
         number[x] += _ONE if valid else _ZERO
 
 
-@compiled
+@kernels.compiled
 def _fitted(
     means: Any, slopes: tuple[float, float], fit: Fit, w: Any, null: float, curve: Any
 ) -> float:
@@ -164,7 +164,7 @@ def _fitted(
     return variance
 
 
-@compiled
+@kernels.compiled
 def _object(
     camera: Camera, curve: Any, maps: Any, noise: Any, variance: float, w: Any, line: Any, x: int
 ) -> None:
@@ -218,7 +218,7 @@ def _object(
         line[15 + i][x] = maps[4 + i]
 
 
-@compiled
+@kernels.compiled
 def _frame(first: Any, second: Any, line: Any, camera: Camera, dt: float, out: Any) -> None:
     """Temperatures of a row of one frame, their deviations, and if they are in range, in place."""
     table, second_table, scale = camera.first, camera.second, _ONE / camera.first.half
@@ -253,7 +253,7 @@ def _frame(first: Any, second: Any, line: Any, camera: Camera, dt: float, out: A
         out[4][x] = _ONE if high | low else out[4][x]
 
 
-@compiled
+@kernels.compiled
 def _terms(block: Block, fit: Fit, camera: Camera, y: int, x: int, work: Any) -> None:
     """Terms of one pixel of a row, NaN where the object is not defined; see `_object`."""
     (line, means, curve, maps, pairs), status = work, block.status[y, x]

@@ -85,7 +85,7 @@ def _smooth(
             left[p, t] = bent if left[p, t] < variance[p, t] else variance[p, t]
 
 
-@compiled
+@kernels.compiled
 def _estimate(window: Array, sums: Array, low: int, high: int, estimate: Array) -> None:
     """Values at the centres of windows of one half-width (time), in place."""
     frames = estimate.size
@@ -97,7 +97,7 @@ def _estimate(window: Array, sums: Array, low: int, high: int, estimate: Array) 
             estimate[t] += weight[t] * (after[t] - before[t])
 
 
-@compiled
+@kernels.compiled
 def _widen(
     estimate: Array,
     shares: tuple[Array, Array],
@@ -120,7 +120,7 @@ def _widen(
     return bool(remaining > 0.0)
 
 
-@compiled
+@kernels.compiled
 def _sum_up(
     values: Array, variance: Array, valid: Mask, position: Array, sums: Array, pad: int
 ) -> tuple[float, float]:
@@ -141,7 +141,7 @@ def _sum_up(
     return level, noise
 
 
-@compiled
+@kernels.allocating
 def _lay_windows(valid: Mask, position: Array, halves: Whole, windows: Array) -> None:
     """Weights of parabolas, or lines, at the centres of windows (half-width, 4, time), in place."""
     sums = np.zeros((position.size + 1, 5))
@@ -155,7 +155,7 @@ def _lay_windows(valid: Mask, position: Array, halves: Whole, windows: Array) ->
             _centre(sums, position, t, halves[k], windows[k, :, t])
 
 
-@compiled
+@kernels.compiled
 def _centre(sums: Array, position: Array, place: int, half: int, window: Array) -> None:
     """Weights of one window's sums of `_sum_up`, and its variance over the noise's, in place."""
     low, high = max(place - half, 0), min(place + half + 1, position.size)

@@ -357,7 +357,7 @@ def _moments(
             _average(terms, way, result[1][p, way], result[2][p, way])
 
 
-@compiled
+@kernels.allocating
 def _condition(
     prior: tuple[Array, Array, Array], grid: Array, density: Array, normal: Array, whole: Array
 ) -> None:
@@ -384,7 +384,7 @@ def _condition(
         log += np.log((grid[high] - grid[low]) / (high - low))  # of the cell
 
 
-@compiled
+@kernels.compiled
 def _settled(
     likelihood: Array, whole: Array, level: Array, place: Array, slope: Array, loose: Array
 ) -> bool:
@@ -397,7 +397,7 @@ def _settled(
     return settled
 
 
-@compiled
+@kernels.allocating
 def _quadratic(
     tables: tuple[kernels.Table, ...],
     curve: tuple[Array, Array, Array],
@@ -441,7 +441,7 @@ def _quadratic(
             result[3], result[4], result[5] = ee, ec, cc
 
 
-@compiled
+@kernels.compiled
 def _eliminate(
     likelihood: Array, normal: Array, level: Array, values: Array, slope: Array, loose: Array
 ) -> tuple[float, float]:
@@ -464,7 +464,7 @@ def _eliminate(
     return evidence + 0.5 * (np.log(scale * precision / curvature) + toward * c), curvature
 
 
-@compiled
+@kernels.allocating
 def _normalise(weight: Array, values: Array, slope: Array, loose: Array, stiff: Array) -> None:
     """Weights (grid, component) that add up to 1 of logarithms, in place."""
     for g, k in np.ndindex(weight.shape):
@@ -481,7 +481,7 @@ def _normalise(weight: Array, values: Array, slope: Array, loose: Array, stiff: 
     weight /= weight.sum()
 
 
-@compiled
+@kernels.allocating
 def _average(terms: tuple[Array, ...], relative: int, mean: Array, spread: Array) -> None:
     """Mean and covariance of (e, c), or of (1 / e_1, e_m / e_1, c), over grid and components."""
     weights, values, slope, loose, stiff = terms
@@ -503,10 +503,9 @@ def _average(terms: tuple[Array, ...], relative: int, mean: Array, spread: Array
             for m in range(size - 2):
                 direction[1 + m] = slope[g, k, m] * scale
                 spread[1 + m, 1 + m] += weight * loose[g, k, m] * scale**2
-            for i in range(size):
-                for j in range(size):
-                    moved = offset[i] * offset[j] + direction[i] * direction[j] / stiff[g, k]
-                    spread[i, j] += weight * moved
+            for i, j in np.ndindex(spread.shape):
+                moved = offset[i] * offset[j] + direction[i] * direction[j] / stiff[g, k]
+                spread[i, j] += weight * moved
 
 
 def fluctuation(tile: Tile, static: Moments, means: Bins, expected: float) -> Array:

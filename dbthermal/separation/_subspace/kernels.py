@@ -37,17 +37,20 @@ _SQUARES, _ROUNDED = 34, 1e-15
 _OPTIONS: Final[dict[str, Any]] = {"nogil": True, "error_model": "numpy", "_nrt": False}
 entered: Final[Callable[..., Any]] = kept(**_OPTIONS)
 """Decorator of compiled functions that are called from outside."""
-
 # Sums may be taken in any order; NaN stays NaN.
 _FLAGS: Final = {"reassoc", "contract", "nsz", "arcp"}
-compiled: Final[Callable[..., Any]] = njit(fastmath=_FLAGS, **_OPTIONS)
+# Python does not call them: to compile an entry for it takes as long as the function.
+_WITHIN: Final = _OPTIONS | {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+compiled: Final[Callable[..., Any]] = njit(fastmath=_FLAGS, **_WITHIN)
 """Decorator of functions that are compiled into those that call them."""
-_WITHIN: Final[dict[str, Any]] = _OPTIONS | {"forceinline": True, "no_cpython_wrapper": True}
-inlined: Final[Callable[..., Any]] = njit(fastmath=_FLAGS, **_WITHIN)
-"""As `compiled`, for what has a work space: to hand over its some 300 numbers takes long."""
+allocating: Final[Callable[..., Any]] = njit(fastmath=_FLAGS, **_WITHIN | {"_nrt": True})
+"""As `compiled`, for functions that make arrays."""
+# Steps stay `compiled`: to compile all of them as a single function takes twice as long.
+inlined: Final[Callable[..., Any]] = njit(fastmath=_FLAGS, forceinline=True, **_WITHIN)
+"""As `compiled`, for parts of a step: to hand over the 300 numbers of a work space takes long."""
 merged: Final[Callable[..., Any]] = njit(fastmath=_FLAGS, inline="always", **_WITHIN)
 """As `inlined`, in one place, from the source: it is not compiled by itself first."""
-_numbers: Final[Callable[..., Any]] = njit(fastmath=_FLAGS | {"nnan"}, **_OPTIONS)
+_numbers: Final[Callable[..., Any]] = njit(fastmath=_FLAGS | {"nnan"}, **_WITHIN)
 
 
 class Table(NamedTuple):
@@ -353,6 +356,7 @@ def projected_both(columns: Array, spans: tiles.Whole, first: Array, last: Array
             c += column[t] * last_section[t]
             d += next_column[t] * last_section[t]
         to[0, j], to[0, j + 1], to[1, j], to[1, j + 1] = a, b, c, d
-    if count % 2:
-        projected(columns[-1:], spans[-1:], 1, first, to[0, -1:])
-        projected(columns[-1:], spans[-1:], 1, last, to[1, -1:])
+    for j in range(count - count % 2, count):
+        start, stop = spans[j]
+        to[0, j] = dot(columns[j, start:stop], first[start:stop])
+        to[1, j] = dot(columns[j, start:stop], last[start:stop])
