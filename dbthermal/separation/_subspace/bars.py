@@ -9,7 +9,7 @@ from scipy.special import chdtri, ndtri
 
 from dbthermal._arrays import Array
 from dbthermal.separation._subspace import kernels, regression
-from dbthermal.separation._subspace.kernels import inlined
+from dbthermal.separation._subspace.kernels import compiled, inlined
 from dbthermal.separation._subspace.pixel import Line, Model, Work, combined
 from dbthermal.separation._subspace.reflection_ratio import CHANCE
 from dbthermal.separation._tiles import Whole
@@ -149,7 +149,7 @@ def _propagate(model: Model, record: Any, epsilon: float, work: Work) -> bool:
     return resting < RESTING * frames
 
 
-@inlined
+@compiled
 def bars(model: Model, record: Any, line: Line, work: Work, covariance: Any) -> None:
     """Variances of emissivities, object and background, in place."""
     z, emitted, weights, kernel = work.first, work.emitted, work.weights, work.kernel
@@ -272,7 +272,7 @@ def _pattern(model: Model, work: Work) -> None:
             work.background_variance[t] += square * off**2
 
 
-@inlined
+@compiled
 def judge(model: Model, work: Work, record: Any, sums: Array) -> None:
     """Judge if the null residual is noise; sums of it and of the object's curve over blocks."""
     residual, rapid, coefficients = work.null_residual, work.rapid, work.coefficients

@@ -14,7 +14,7 @@ from dbthermal._arrays import Array
 from dbthermal.response import Curve
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._subspace import bars, kernels, pieces, pixel, reflection_ratio
-from dbthermal.separation._subspace.kernels import inlined
+from dbthermal.separation._subspace.kernels import compiled, inlined
 from dbthermal.separation._subspace.pixel import Model, Work
 from dbthermal.separation._tiles import Mask, Pixels, Survey, Tile, Whole
 
@@ -184,7 +184,7 @@ def _straighten(work: Work, bands: int, frames: int) -> None:
             straight[t] = signal[t] - bend[t]
 
 
-@inlined
+@compiled
 def _scatters(model: Model, work: Work, record: Any, matrices: Any) -> None:
     """Scatter less noise at the pixel's order and at two large ones, in place."""
     bands, frames, orders = work.noise.size, work.first.size, len(work.scatter)
@@ -199,10 +199,9 @@ def _scatters(model: Model, work: Work, record: Any, matrices: Any) -> None:
         if place > 0:
             order = max(1, orders - reflection_ratio.FEWER * (2 - place))
         record.freedom[place] = frames - model.steps - order
-        for m in range(bands):
-            for k in range(bands):
-                noise = record.freedom[place] * work.turned[m, k]
-                matrices[place, m, k] = work.scatter[order - 1, m, k] - noise
+        for m, k in np.ndindex(bands, bands):
+            noise = record.freedom[place] * work.turned[m, k]
+            matrices[place, m, k] = work.scatter[order - 1, m, k] - noise
 
 
 @inlined
@@ -221,14 +220,13 @@ def _straight_noise(model: Model, work: Work, covariance: Array, rate: Array) ->
         rate[m] = (1.0 - emissivity) / work.noise[m] * kernels.exact(response, level)[1]
         energy += rate[m] ** 2
         physical &= 0.0 < emissivity < 1.0
-    for m in range(rate.size):
-        for k in range(rate.size):
-            covariance[m, k] = 1.0 if m == k else 0.0
-            if physical and energy > 0.0:
-                first = rate[m] - (1.0 - work.emissivity[m]) / work.noise[m] * slope
-                second = rate[k] - (1.0 - work.emissivity[k]) / work.noise[k] * slope
-                shared = first * rate[k] + rate[m] * second - first * second
-                covariance[m, k] -= shared / energy
+    for m, k in np.ndindex(rate.size, rate.size):
+        covariance[m, k] = 1.0 if m == k else 0.0
+        if physical and energy > 0.0:
+            first = rate[m] - (1.0 - work.emissivity[m]) / work.noise[m] * slope
+            second = rate[k] - (1.0 - work.emissivity[k]) / work.noise[k] * slope
+            shared = first * rate[k] + rate[m] * second - first * second
+            covariance[m, k] -= shared / energy
 
 
 @inlined

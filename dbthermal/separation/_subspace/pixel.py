@@ -8,7 +8,7 @@ import numpy as np
 from dbthermal._arrays import Array
 from dbthermal.separation._frames import newton, null_weights
 from dbthermal.separation._subspace import kernels, reflection_ratio, regression
-from dbthermal.separation._subspace.kernels import inlined
+from dbthermal.separation._subspace.kernels import compiled, inlined
 from dbthermal.separation._tiles import Whole
 
 ROUNDS: Final = 3
@@ -108,7 +108,7 @@ class Line(NamedTuple):
     known: bool  # the emissivity is the material's
 
 
-@inlined
+@compiled
 def ratios(model: Model, work: Work, record: Any) -> None:
     r"""Step 1; coefficients, ratios and null combination in place, and how well they are known.
 
@@ -120,16 +120,16 @@ def ratios(model: Model, work: Work, record: Any) -> None:
     noise, material, ratio, axis = work.noise, work.material, work.ratio, work.axis
     bands, orders, frames = noise.size, len(work.scatter), work.first.size
     scatter(model, work)
-    pooled, along = False, work.material_axis
+    pooled, along = not np.isnan(material[6]), work.material_axis
     # A material's ratios are used unless the pixel's rapid changes contradict them by 4 sigma.
-    if not np.isnan(material[6]):
+    if pooled:
         length = 0.0
         for m in range(bands):
             along[m] = material[5 + m] / noise[m]
             length += along[m] ** 2
         for m in range(bands):
             along[m] /= sqrt(length)
-        pooled = _agrees(work.scatter[_order(work, True, frames)], along, model.chances[0])
+        pooled = _agrees(work.scatter[_order(work, pooled, frames)], along, model.chances[0])
     order = _order(work, pooled, frames)
     free, chosen = frames - model.steps - (order + 1.0), work.scatter[order]
     null = _across(chosen, work, pooled)
@@ -326,7 +326,7 @@ def combined(weights: Array, coefficients: Array, count: int, columns: Array) ->
             columns[j] += weights[m] * coefficients[m, j]
 
 
-@inlined
+@compiled
 def emission(model: Model, record: Any, work: Work, rounds: int) -> Line:
     """Steps 2 and 3 in turns: the object (eq. 5, 6) and the emissivities (eq. 7), in place."""
     z, weights, temperature = work.first, work.weights, work.temperature
@@ -367,7 +367,7 @@ def emission(model: Model, record: Any, work: Work, rounds: int) -> Line:
     return Line(variance, scale, energy, fixed)
 
 
-@inlined
+@compiled
 def background(model: Model, work: Work) -> None:
     """Step 4 (eq. 9), in place."""
     tables, emissivity, share, frames = model.tables, work.emissivity, work.share, work.first.size
