@@ -142,7 +142,7 @@ def _add(first: Any, second: Any, total: Any, second_total: Any, number: Any) ->
         number[x] += _ONE if valid else _ZERO
 
 
-@kernels.compiled
+@kernels.allocating
 def _fitted(
     means: Any, slopes: tuple[float, float], fit: Fit, w: Any, null: float, curve: Any
 ) -> float:
