@@ -15,6 +15,7 @@ from scenes import Shelf
 
 from dbthermal import simulation
 from dbthermal.simulation import Background, Rig
+from reproduction.experiments.cases import independent_pixels
 
 hypothesis.settings.register_profile("untimed", deadline=None)  # a test measures no time
 hypothesis.settings.load_profile("untimed")
@@ -64,7 +65,7 @@ def glass() -> tuple[xr.Dataset, xr.Dataset, xr.Dataset]:
     """Scene, capture and response: glass 0.86/0.72, 20 pixels as an image of 4 by 5."""
     rig, time, rng = Rig(), np.arange(350) / 10.0, np.random.default_rng(11)
     emissivity = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(rig.bands)})
-    make = simulation.independent_pixels
+    make = independent_pixels
     flat = make(time, emissivity, Background(), 20, rng, start=293.15, stop=333.15)
     names = ("object_temperature", "background_temperature")
     warm, cold = (flat[name].values.reshape(350, 4, 5) for name in names)

@@ -101,8 +101,9 @@ def equalise(
     for band, film in enumerate(counts):
         slope, deviation = inputs.curves[band].reference_slope, float(np.sqrt(variances[band]))
         outside = 1.0 - ndimage.gaussian_filter(np.ones(maps.shape[2:]), deviation, mode="constant")
+        of_object = np.stack([maps[band], details[band]], axis=1)
         for frame, values, at in zip(film, measured.values[band], functions, strict=True):
-            slow, detail = slope * np.tensordot(at, [maps[band], details[band]], (0, 1))
+            slow, detail = slope * np.tensordot(at, of_object, 1)
             rapid = _blurred(frame - slow, deviation)
             error[band] += (outside * rapid / slope) ** 2
             valid = np.isfinite(values) & inputs.good
@@ -111,8 +112,7 @@ def equalise(
     # Noise in the smooth functions stays as it was.
     after = np.array([_noise_after(variance) for variance in variances])
     noise = (1.0 - after) * functions.shape[1] * inputs.noise**2
-    error += noise[:, np.newaxis, np.newaxis]
-    square = np.square(misfits.object_weights(inputs, result)) * error
+    square = np.square(misfits.object_weights(inputs, result)) * (error.T + noise).T
     detail = np.sqrt(square.sum(axis=0) / len(functions))
     factor = np.sqrt(after) * schema.noise_factor(corrected)
     capture = corrected.assign(counts=measured.copy(data=counts), noise_factor=("band", factor))
@@ -158,9 +158,8 @@ def _local(maps: Array) -> Array:
 
 def _noise_after(variance: float) -> float:
     """Variance of white noise after a blur [pixel^2] over that before."""
-    point = np.zeros((1 + 8 * int(np.ceil(np.sqrt(variance))),) * 2)
-    point[point.shape[0] // 2, point.shape[1] // 2] = 1.0
-    return float(np.sum(_blurred(point, float(np.sqrt(variance))) ** 2))
+    deviation = float(np.sqrt(variance))
+    return float(np.sum(_blurred(np.pad([[1.0]], 1 + int(4.0 * deviation)), deviation) ** 2))
 
 
 def _blurred_maps(maps: Array, variance: float) -> Array:
@@ -259,9 +258,7 @@ def _equations(
     # Noise in the products: that of the first band, in all three.
     free = len(basis) - basis.shape[1]
     levels = inputs.noise[[inputs.bands[0], inputs.bands[place]]] ** 2
-    point = np.zeros((1 + 2 * int(np.ceil(4.0 * np.sqrt(_BROAD))),) * 2)
-    point[point.shape[0] // 2, point.shape[1] // 2] = 1.0
-    spread = _details(point, blurs[0])
+    spread = _details(np.pad([[1.0]], int(np.ceil(4.0 * np.sqrt(_BROAD)))), blurs[0])
     bent = ndimage.laplace(spread)
     level, mixed, bending = (
         free * levels[0] * fftconvolve(moving, a * b, mode="same")

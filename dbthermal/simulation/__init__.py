@@ -23,7 +23,6 @@ __all__ = [
     "capture",
     "digitise",
     "heating",
-    "independent_pixels",
     "observe",
     "pattern",
     "scene",
@@ -174,34 +173,6 @@ def side_by_side(emissivity: xr.DataArray, shape: tuple[int, int]) -> xr.DataArr
     image = np.broadcast_to(columns, (emissivity.sizes["band"], *shape))
     axes = {"band": emissivity["band"].values}
     return xr.DataArray(image, axes, ("band", "y", "x"), attrs={"units": "1"})
-
-
-def independent_pixels(
-    time: Array,
-    emissivity: xr.DataArray,
-    background: Background,
-    pixels: int,
-    rng: np.random.Generator,
-    *,
-    start: float,
-    stop: float,
-    time_constant: tuple[float, float] = (8.0, 20.0),
-) -> xr.Dataset:
-    """Scene of one row of pixels of one material, each with its own heating and background.
-
-    Parameters
-    ----------
-    time, emissivity : ndarray, DataArray
-        Times (time,) [s]; emissivity (band) [1].
-    background, pixels, rng : Background, int, Generator
-        Variation of the background; number of pixels; source of randomness.
-    start, stop, time_constant : float, float, tuple of float
-        First and last object temperature [K]; range of the heating's time constant [s].
-    """
-    constants = rng.uniform(*time_constant, pixels)
-    warm = heating(time, start, stop, constants)
-    cold = background.draw(time, pixels, rng)
-    return scene(time, warm[:, np.newaxis], cold[:, np.newaxis], emissivity)
 
 
 def walkers(

@@ -11,10 +11,11 @@ from hypothesis import strategies as st
 from refused import refused
 from scipy.interpolate import BarycentricInterpolator
 
-from dbthermal import separation, simulation
+from dbthermal import separation
 from dbthermal.alignment import align, exposure_times, fill_times, time_offset
 from dbthermal.simulation import Background, Rig
 from reproduction.disturbances import expose
+from reproduction.experiments.cases import independent_pixels
 
 RIG = Rig()
 FRAMES, STEPS, START = 350, 20, 80
@@ -36,7 +37,7 @@ def glass(
     """Glass that warms from 20 C, on a clock of 20 steps a frame."""
     value = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(RIG.bands)})
     rng, moves = np.random.default_rng(seed), Background(**background)  # type: ignore[arg-type]
-    return simulation.independent_pixels(FINE, value, moves, pixels, rng, start=293.15, stop=stop)
+    return independent_pixels(FINE, value, moves, pixels, rng, start=293.15, stop=stop)
 
 
 def exposed(

@@ -25,6 +25,7 @@ from dbthermal.schema import Status
 from dbthermal.simulation import Background
 from reproduction import disturbances
 from reproduction.experiments import cases
+from reproduction.experiments.cases import independent_pixels
 
 
 @pytest.fixture(scope="module")
@@ -138,7 +139,7 @@ def test_events_that_overlap_are_one(runs: list[tuple[str, int, int]], segments:
 def test_separation_stands_a_shutter_and_lost_frames(nuisance: str) -> None:
     """An event of tens of counts, or a frame of twenty lost, costs the object less than 20 %."""
     rng, time = np.random.default_rng(11), np.arange(350) / 10.0
-    scene = simulation.independent_pixels(
+    scene = independent_pixels(
         time, emissivity_of(0.86, 0.72), Background(), 400, rng, start=293.15, stop=318.15
     )
     capture = simulation.observe(scene, RIG.response(), rng)

@@ -16,7 +16,7 @@ from dbthermal import emissivity, limits, mixing, simulation
 from dbthermal import response as responses
 from dbthermal.limits import SKY, _fisher
 from dbthermal.simulation import Background, Rig
-from reproduction.experiments.cases import ratio_variance_bound
+from reproduction.experiments.cases import independent_pixels, ratio_variance_bound
 
 RIG = Rig()
 THREE = Rig(bands=("8-14", "9.5", "10.6"), noise=(0.03, 0.35, 0.15))
@@ -30,7 +30,7 @@ def scene_of(
     """Pixels of one material, heated from 20 C."""
     maps, moves = emissivity_of(*values, bands=rig.bands), Background(**background)
     rng = np.random.default_rng(4)
-    return simulation.independent_pixels(TIME, maps, moves, pixels, rng, start=293.15, stop=stop)
+    return independent_pixels(TIME, maps, moves, pixels, rng, start=293.15, stop=stop)
 
 
 def linear_noise(rig: Rig) -> tuple[float, float]:

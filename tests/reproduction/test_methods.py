@@ -14,6 +14,7 @@ from dbthermal import bands, mixing, planck, schema, separation, simulation
 from dbthermal import response as responses
 from dbthermal.simulation import Background, Rig
 from reproduction import experiments, methods
+from reproduction.experiments.cases import independent_pixels
 from reproduction.methods.bcp import BcpSettings
 from reproduction.methods.dbvt import METHOD as DBVT
 from reproduction.methods.dbvt import DbvtSettings
@@ -52,7 +53,7 @@ def solve(capture: xr.Dataset, method: str, settings: Any = None, **options: Any
 
 def drawn(time: Floats, pixels: int, rng: np.random.Generator) -> xr.Dataset:
     """Scene of glass heated from 20 to 60 C, someone walking by."""
-    glass = simulation.independent_pixels
+    glass = independent_pixels
     return glass(time, GLASS, Background(), pixels, rng, start=293.15, stop=333.15)
 
 

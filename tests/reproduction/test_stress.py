@@ -12,8 +12,9 @@ from matplotlib.figure import Figure
 
 from dbthermal import schema
 from dbthermal.figures import REASONS, status
-from dbthermal.simulation import Background, independent_pixels
+from dbthermal.simulation import Background
 from reproduction.experiments import limits
+from reproduction.experiments.cases import independent_pixels
 from reproduction.figures.errors import validity
 
 OBJECT = "object_temperature"

@@ -13,6 +13,7 @@ from worlds import RESPONSE, World, seen
 from dbthermal import separation, simulation
 from dbthermal.schema import Status
 from dbthermal.simulation import Background, Rig
+from reproduction.experiments.cases import independent_pixels
 
 RIG = Rig()
 GLASS = emissivity_of(0.86, 0.72)
@@ -49,7 +50,7 @@ def seen_at(
     quick = not slow and since[-1] > 5.0 and np.sum(since < 20.0) > 150
     constants = (8.0, 20.0) if quick else (0.25 * since[-1], 0.6 * since[-1])  # s
     passing, warming = (
-        simulation.independent_pixels(
+        independent_pixels(
             clock, GLASS, Background(), pixels, rng, start=293.15, stop=323.15, time_constant=tau
         )
         for clock, tau in ((np.arange(time.size) / 10.0, (8.0, 20.0)), (since, constants))

@@ -11,6 +11,7 @@ from attack.scenes import counts_of
 from dbthermal import calibration, separation, simulation
 from dbthermal.response import EXACT
 from dbthermal.simulation import Background, Rig
+from reproduction.experiments.cases import independent_pixels
 
 Floats = npt.NDArray[np.float64]
 Case = tuple[xr.Dataset, xr.Dataset, xr.Dataset]
@@ -84,7 +85,7 @@ def simulated(noise: tuple[float, ...], emissivity: Floats, seed: int, frames: i
     value = xr.DataArray(emissivity[:, 0], dims="band", coords={"band": list(rig.bands)})
     time, pixels = np.arange(frames) * 35.0 / frames, emissivity.shape[1]
     ends: dict[str, Any] = {"start": 293.15, "stop": 333.15}
-    scene = simulation.independent_pixels(time, value, Background(), pixels, rng, **ends)
+    scene = independent_pixels(time, value, Background(), pixels, rng, **ends)
     return scene, simulation.observe(scene, rig.response(), rng), rig.response()
 
 

@@ -16,6 +16,7 @@ from dbthermal import schema, separation, simulation
 from dbthermal.schema import Status
 from dbthermal.simulation import Background, Rig
 from reproduction import methods
+from reproduction.experiments.cases import independent_pixels
 from reproduction.methods.bcp import BcpSettings
 from reproduction.methods.dbvt import DbvtSettings
 
@@ -41,7 +42,7 @@ def capture_of(
 ) -> xr.Dataset:
     """Capture of a surface that warms up by 30 K, each pixel before a background of its own."""
     rng, frames = np.random.default_rng(1), time.size
-    flat = simulation.independent_pixels(
+    flat = independent_pixels(
         time, emissivity, Background(), shape[0] * shape[1], rng, start=293.15, stop=323.15
     )
     warm, cold = (flat[name].values.reshape(frames, *shape) for name in FILMS)
@@ -111,7 +112,7 @@ def test_good_means_complete(
     knows = methods.get_method(method).knows_emissivity
     if knows and first == second:
         return
-    scene = simulation.independent_pixels(
+    scene = independent_pixels(
         np.arange(frames) / 10.0, known, Background(), 40, rng, start=293.15, stop=323.15
     )
     response = rig.response()

@@ -16,6 +16,7 @@ from dbthermal.schema import Status
 from dbthermal.simulation import Background, Rig
 from reproduction import methods
 from reproduction.experiments import cases
+from reproduction.experiments.cases import independent_pixels
 from reproduction.experiments.twins import reflected_change
 from reproduction.methods.dbvt import DbvtSettings
 
@@ -201,7 +202,7 @@ def test_an_object_as_linear_as_the_drift_has_wide_intervals(stop: int) -> None:
     background, response = simulation.Background(drift=8.0), RIG.response()
     ends: dict[str, Any] = {"start": 293.15, "stop": stop + 273.15, "time_constant": (25.0, 80.0)}
     parts = (TIME, glass, background, 300, rng)
-    scene = simulation.independent_pixels(*parts, **ends)
+    scene = independent_pixels(*parts, **ends)
     share = coverage(scene, separation.solve(simulation.observe(scene, response, rng), response))
     assert np.all(share >= 0.92)
 
@@ -418,7 +419,7 @@ def test_a_gray_third_band_harms_nothing() -> None:
         value = xr.DataArray([0.86, 0.72, 0.86], dims="band", coords={"band": list(BANDS[:3])})
         rng = np.random.default_rng(7)
         parts = (TIME, value, Background(), 200, rng)
-        scene = simulation.independent_pixels(*parts, start=293.15, stop=333.15)
+        scene = independent_pixels(*parts, start=293.15, stop=333.15)
         capture = simulation.observe(scene, rig.response(), rng).isel(band=slice(0, bands))
         result = separation.solve(capture, rig.response())
         error = result["object_temperature"] - scene["object_temperature"]
@@ -508,9 +509,7 @@ def test_reflected_change() -> None:
     rig, value = Rig(noise=(0.003, 0.035)), emissivity_of(0.86, 0.72)
     for stop in (293.15, 303.15):  # a constant object, and one that warms
         rng = np.random.default_rng(4)
-        scene = simulation.independent_pixels(
-            TIME, value, Background(), 40, rng, start=293.15, stop=stop
-        )
+        scene = independent_pixels(TIME, value, Background(), 40, rng, start=293.15, stop=stop)
         capture = simulation.observe(scene, rig.response(), rng)
         result = separation.solve(capture, rig.response())
         apparent = responses.apparent_temperature(rig.response(), capture["counts"])

@@ -10,6 +10,7 @@ from scenes import held
 
 from dbthermal import separation, simulation, store
 from dbthermal.simulation import Background
+from reproduction.experiments.cases import independent_pixels
 from reproduction.experiments.pictures import Picture, smooth_shift
 
 RIG = simulation.Rig()
@@ -85,7 +86,7 @@ def test_motion_is_no_noise() -> None:
         for correlation_time in (0.01, 0.1, 0.3, 3.0):
             walk = Background("random walk", correlation_time=correlation_time)
             args = (TIME, materials, walk, 400, rng)
-            scenes.append(simulation.independent_pixels(*args, start=293.15, stop=323.15))
+            scenes.append(independent_pixels(*args, start=293.15, stop=323.15))
     for place, scene in enumerate(scenes):
         result = separation.solve(simulation.observe(scene, RIG.response(), rng), RIG.response())
         assert result.attrs["noise_source"] == "response", place

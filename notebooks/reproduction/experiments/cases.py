@@ -31,6 +31,34 @@ _OPTIONAL: Final = frozenset(
 )
 
 
+def independent_pixels(
+    time: Array,
+    emissivity: xr.DataArray,
+    background: Background,
+    pixels: int,
+    rng: np.random.Generator,
+    *,
+    start: float,
+    stop: float,
+    time_constant: tuple[float, float] = (8.0, 20.0),
+) -> xr.Dataset:
+    """Scene of one row of pixels of one material, each with its own heating and background.
+
+    Parameters
+    ----------
+    time, emissivity : ndarray, DataArray
+        Times (time,) [s]; emissivity (band) [1].
+    background, pixels, rng : Background, int, Generator
+        Variation of the background; number of pixels; source of randomness.
+    start, stop, time_constant : float, float, tuple of float
+        First and last object temperature [K]; range of the heating's time constant [s].
+    """
+    constants = rng.uniform(*time_constant, pixels)
+    warm = simulation.heating(time, start, stop, constants)
+    cold = background.draw(time, pixels, rng)
+    return simulation.scene(time, warm[:, np.newaxis], cold[:, np.newaxis], emissivity)
+
+
 @dataclass(frozen=True)
 class Jump:
     """Change of the object that is not a smooth curve, as when a palm is laid on a bulb."""
@@ -175,7 +203,7 @@ def _draw(
     emissivity = xr.DataArray(pair, dims="band", coords={"band": list(bands)})
     background = Background(**case.get("background", {}))
     ends = {name: case[name] + zero_Celsius for name in ("start", "stop")}
-    scene = simulation.independent_pixels(time, emissivity, background, pixels, rng, **ends)
+    scene = independent_pixels(time, emissivity, background, pixels, rng, **ends)
     warm, cold = scene["object_temperature"], scene["background_temperature"]
     cold = cold + case.get("following", 0.0) * (warm - warm.isel(time=0))
     if "jump" in case:

@@ -14,7 +14,7 @@ from dbthermal.correction import mark_shutter
 from dbthermal.simulation import Background, Rig
 from reproduction import disturbances
 from reproduction.cache import gridded
-from reproduction.experiments.cases import STEPS, held, rmse, scalars
+from reproduction.experiments.cases import STEPS, held, independent_pixels, rmse, scalars
 from reproduction.experiments.limits import on_clock
 
 TREATMENTS: Final = ("as recorded", "undone", "without")
@@ -55,9 +55,7 @@ class Pixels:
         time = np.arange((count - 1) * steps + 1 + later) / (rate * steps)
         value = xr.DataArray(list(self.emissivity), dims="band", coords={"band": list(Rig().bands)})
         background, (start, stop) = Background(**self.background), self.ends
-        return simulation.independent_pixels(
-            time, value, background, self.pixels, rng, start=start, stop=stop
-        )
+        return independent_pixels(time, value, background, self.pixels, rng, start=start, stop=stop)
 
 
 def apart(delay: float, *, pixels: Mapping[str, Any], seed: int) -> xr.Dataset:

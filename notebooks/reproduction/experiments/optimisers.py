@@ -18,6 +18,7 @@ import xarray as xr
 from dbthermal import response as responses
 from dbthermal import simulation
 from dbthermal.separation._tiles import Array, Tile
+from reproduction.experiments.cases import independent_pixels
 from reproduction.methods import dbvt_objective as objective
 from reproduction.methods.dbvt import DbvtSettings, Search
 
@@ -42,9 +43,7 @@ def plate(
     rng, rig = np.random.default_rng(seed), simulation.Rig(noise=tuple(noise))
     value = xr.DataArray(list(emissivity), {"band": list(rig.bands)}, "band")
     clock, background = np.arange(frames, dtype=float) * INTERVAL, simulation.Background()
-    scene = simulation.independent_pixels(
-        clock, value, background, pixels, rng, start=293.15, stop=333.15
-    )
+    scene = independent_pixels(clock, value, background, pixels, rng, start=293.15, stop=333.15)
     curves = tuple(responses.curve(rig.response(), band, "linear") for band in rig.bands)
     names = ("object_temperature", "background_temperature")
     warm, cold = (scene[name].values[:, 0] - curves[0].reference for name in names)

@@ -17,7 +17,7 @@ from dbthermal import response as responses
 from dbthermal.instruments.recording import open_capture
 from reproduction import paths
 from reproduction.experiments import emulated
-from reproduction.experiments.cases import held, rmse
+from reproduction.experiments.cases import held, independent_pixels, rmse
 from reproduction.figures.scenes import truth_and_estimate
 from reproduction.run import Run
 
@@ -194,7 +194,7 @@ def trial(emissivity: float, noise: float) -> Figure:
     share = xr.DataArray([emissivity, emissivity - DIFFERENCE], {"band": list(rig.bands)}, "band")
     # Simulate, observe and separate a few pixels, of which one is shown.
     time, rng = np.arange(_FRAMES) / _RATE, np.random.default_rng(_SEED)
-    pixels, background = simulation.independent_pixels, simulation.Background()
+    pixels, background = independent_pixels, simulation.Background()
     scene = pixels(time, share, background, _PIXELS, rng, start=293.15, stop=333.15)  # [K]
     capture = simulation.observe(scene, rig.response(), rng)
     result = separation.solve(capture, rig.response(), workers=1)
