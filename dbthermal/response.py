@@ -204,8 +204,9 @@ def accuracy(
     limits |= {"gain_std": (0.0, 1.0), "background_ratio_std": (0.0, 1.0)}  # relative, not in %
     for name, default in ACCURACY.items():
         value = np.asarray(response.get(name, default), np.float64)
-        within = limits.get(name, (0.0, schema.LARGEST))
-        stated[name] = _numbers.real_numbers(f"{name} of the response", value, within)
+        stated[name], within = value, limits.get(name, (0.0, schema.LARGEST))
+        if not np.all((value >= within[0]) & (value <= within[1])):
+            _numbers.real_numbers(f"{name} of the response", value, within)  # says which and why
     offset, gain, pattern = (
         np.broadcast_to(stated[name], response.sizes["band"])[places]
         for name in ("offset_std", "gain_std", "pattern_std")
@@ -303,9 +304,11 @@ def noise(response: xr.Dataset, bands: list[str]) -> Array:
     if "noise" not in schema.check(response, "response"):
         raise ValueError("Missing noise of the response. Must be given to fit_response.")
     places = schema.band_positions(response, bands, "the response")
-    values = zip(bands, response["noise"].values[places], strict=True)
-    label, within = "noise [count] in band '{}'", _numbers.POSITIVE
-    return np.array([_numbers.real_number(label.format(band), it, within) for band, it in values])
+    values = np.asarray(response["noise"].values[places], dtype=np.float64)
+    if np.any(bad := ~((values > 0) & np.isfinite(values))):
+        label = f"Invalid noise [count] {values[bad][0]} in band '{bands[int(np.argmax(bad))]}'"
+        raise ValueError(f"{label}. Must be finite and positive.")
+    return values
 
 
 def counts(response: xr.Dataset, temperature: xr.DataArray) -> xr.DataArray:

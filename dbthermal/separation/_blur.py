@@ -5,8 +5,7 @@ With Gaussian blurs of variances s, the rapid changes h of band m are those of t
 .. math:: h_m / k_m - h_1 = c \nabla^2 h_1 + \delta h_1, \quad c = (s_m - s_1) / 2
 
 with an error delta of the ratio that is common to a neighbourhood, and least squares over all
-pixels. The band that is sharper is blurred, and c is sought again until nothing is left. What a
-lens takes from the object's details, which a rough surface does not, the sharpest band tells.
+pixels. The band that is sharper is blurred, and c is sought again until nothing is left.
 """
 
 from dataclasses import dataclass
@@ -93,7 +92,7 @@ def equalise(
             valid = np.isfinite(values) & inputs.good
             film[number] = without_gaps(values, valid)
             fit[:, number] *= valid.any()
-        fit = np.linalg.solve(fit @ functions, fit)
+        fit = np.linalg.pinv(fit @ functions, hermitian=True) @ fit
         maps[band] = np.tensordot(fit, film, 1) / inputs.curves[band].reference_slope
         release()
     details, error = _details_of_object(maps, variances, inputs.noise)
@@ -113,10 +112,9 @@ def equalise(
     after = np.array([_noise_after(variance) for variance in variances])
     noise = (1.0 - after) * functions.shape[1] * inputs.noise**2
     square = np.square(misfits.object_weights(inputs, result)) * (error.T + noise).T
-    detail = np.sqrt(square.sum(axis=0) / len(functions))
     factor = np.sqrt(after) * schema.noise_factor(corrected)
     capture = corrected.assign(counts=measured.copy(data=counts), noise_factor=("band", factor))
-    return Equalised(capture, variances, detail)
+    return Equalised(capture, variances, np.sqrt(square.sum(axis=0) / len(functions)))
 
 
 def _details_of_object(maps: Array, variances: Array, noise: Array) -> tuple[Array, Array]:
@@ -167,8 +165,8 @@ def _blurred_maps(maps: Array, variance: float) -> Array:
     deviation = float(np.sqrt(variance))
     reach = 1 + int(4.0 * deviation)
     around = np.pad(maps, ((0, 0), (reach, reach), (reach, reach)), "reflect", reflect_type="odd")
-    blurred = ndimage.gaussian_filter(around, deviation, axes=(1, 2))
-    return np.asarray(blurred[:, reach:-reach, reach:-reach])
+    blurred: Array = ndimage.gaussian_filter(around, deviation, axes=(1, 2))
+    return blurred[:, reach:-reach, reach:-reach]
 
 
 def _blurred(image: npt.NDArray[np.floating], deviation: float) -> Array:
@@ -226,8 +224,7 @@ def _equations(
     rows, _, films, frames, pixels, gain = reading
     shape = (rows.stop - rows.start, result.sizes["x"])
     ratio = result["reflection_ratio"].values[inputs.bands[place], rows]
-    inner = np.zeros(shape, dtype=bool)
-    inner[_EDGE:-_EDGE, _EDGE:-_EDGE] = True
+    inner = np.pad(np.ones(np.subtract(shape, 2 * _EDGE), dtype=bool), _EDGE)
     moving = pixels.reshape(shape) & np.isfinite(ratio)
     ratio, used = np.where(moving, ratio, 1.0), inner & moving
     # At the border of a material reflectivities change, not reflections.
