@@ -262,7 +262,7 @@ CASES: list[tuple[Call, str]] = [
     (captured(status=(("y", "x"), np.full(SHAPE, 2**21, np.uint32))), "Unknown bits 2097152"),
     (viewed(noise=units(CAMERA["noise"], "K")), "units 'K' of 'noise' of the response"),
     (viewed(noise=3.0), "Invalid dims .. of 'noise' of the response"),
-    (viewed(noise=("band", [1.0, -1.0])), "noise .count. in band '9.5' -1.0. Must be finite"),
+    (viewed(noise=("band", [1.0, -1.0])), "noise .count. -1.0 in band '9.5'. Must be finite"),
     (viewed(offset=("band", [np.nan, 0.0])), "offset of the response in band '8-14'. Must be fin"),
     *((partial(make, **values), named) for make, values, named in SETTINGS),
     (displaced(lambda it: it.assign_attrs(reference_band="9.5")), "reference_band .'9.5'. of"),
