@@ -10,10 +10,10 @@ from refused import refused
 
 from dbthermal import readers, schema
 from dbthermal import response as responses
-from dbthermal.simulation import Rig
+from dbthermal.simulation import Background, Rig
 from reproduction import paths
 from reproduction.experiments import flags, limits, nuisances
-from reproduction.experiments.cases import simulate
+from reproduction.experiments.cases import independent_pixels, simulate
 
 TIME = np.arange(350) / 10.0  # s
 GLASS: dict[str, Any] = {"case": "glass", "emissivity": [0.86, 0.72], "start": 20, "stop": 60}
@@ -151,3 +151,15 @@ def test_every_flag_has_a_scene() -> None:
     """The full table lacks no flag but that of the optimiser, which the default way never sets."""
     listed = readers.read_yaml(paths.params("10_limits"))["cases"]["flags"]
     assert set(schema.Status.bits()) - set(listed) <= {"not_converged"}
+
+
+def test_independent_pixels(rng: np.random.Generator) -> None:
+    """Each pixel has its own curve and background, all from start to stop, with the same glass."""
+    glass = xr.DataArray(GLASS["emissivity"], dims="band", coords={"band": ["8-14", "9.5"]})
+    span: Any = {"start": 293.15, "stop": 333.15}
+    made = independent_pixels(TIME, glass, Background(), 50, rng, **span)
+    assert dict(made["object_temperature"].sizes) == {"time": TIME.size, "y": 1, "x": 50}
+    ends = made["object_temperature"].isel(time=[0, -1], y=0)
+    np.testing.assert_allclose(ends.T, [[293.15, 333.15]] * 50, rtol=0, atol=1e-10)
+    assert np.unique(made["object_temperature"].isel(time=60)).size == 50
+    np.testing.assert_array_equal(made["emissivity"].isel(y=0, x=7), glass)

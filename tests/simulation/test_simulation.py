@@ -15,7 +15,6 @@ from refused import refused
 from dbthermal import bands, response, schema, simulation
 from dbthermal.simulation import Background, Rig, capture, heating, observe
 from reproduction import disturbances
-from reproduction.experiments.cases import independent_pixels
 
 TIME = np.arange(120) / 10.0  # s
 GLASS = xr.DataArray([0.86, 0.72], dims="band", coords={"band": ["8-14", "9.5"]})
@@ -97,17 +96,6 @@ def test_walkers(made: Made) -> None:
     np.testing.assert_allclose(plate.isel(time=0), 295.15, rtol=0, atol=1e-12)
     assert 332.0 < float(plate.isel(time=-1).max()) < 333.15
     assert twin.attrs["origin"] == "simulated"
-
-
-def test_independent_pixels(rng: np.random.Generator) -> None:
-    """Each pixel has its own curve and background, all from start to stop, with the same glass."""
-    span: Any = {"start": 293.15, "stop": 333.15}
-    made = independent_pixels(TIME, GLASS, Background(), 50, rng, **span)
-    assert dict(made["object_temperature"].sizes) == {"time": 120, "y": 1, "x": 50}
-    ends = made["object_temperature"].isel(time=[0, -1], y=0)
-    np.testing.assert_allclose(ends.T, [[293.15, 333.15]] * 50, rtol=0, atol=1e-10)
-    assert np.unique(made["object_temperature"].isel(time=60)).size == 50
-    np.testing.assert_array_equal(made["emissivity"].isel(y=0, x=7), GLASS)
 
 
 def test_response_is_planck_s() -> None:
