@@ -38,9 +38,9 @@ def smooth(values: Array, variance: Array, valid: Mask, time: Array) -> tuple[Ar
     halves = [1]
     while halves[-1] < time.size:
         halves.append(max(halves[-1] + 1, int(halves[-1] * _GROWTH)))
-    result, left = np.empty((2, *rows[0].shape))
-    _smooth(*rows, position, np.array(halves[:-1], dtype=np.intp), result, left)
-    return result.T, left.T
+    result, spread = np.empty((2, *rows[0].shape))
+    _smooth(*rows, position, np.array(halves[:-1], dtype=np.intp), result, spread)
+    return result.T, spread.T
 
 
 @compiled
@@ -51,7 +51,7 @@ def _smooth(
     position: Array,
     halves: Whole,
     result: Array,
-    left: Array,
+    spread: Array,
 ) -> None:
     """As `smooth`, (pixel, time) in place."""
     frames, pad = position.size, halves[-1] if halves.size else 0
@@ -67,12 +67,12 @@ def _smooth(
         level, noise = _sum_up(values[p], variance[p], valid[p], position, sums, pad)
         for t in range(frames):
             lower[t], upper[t], agreeing[t] = -np.inf, np.inf, 1.0 if valid[p, t] else 0.0
-            widest[t], left[p, t] = -1, variance[p, t]
+            widest[t], spread[p, t] = -1, variance[p, t]
         for k in range(halves.size):
             _estimate(windows[k], sums, pad - halves[k], pad + halves[k] + 1, estimate)
             # One window narrower than the widest that agrees: its bias is small beside its noise.
             shares = windows[k, 3], windows[k - 1, 3] if k > 0 else unbounded
-            if not _widen(estimate, shares, noise, k - 1, bounds, left[p], widest):
+            if not _widen(estimate, shares, noise, k - 1, bounds, spread[p], widest):
                 break
         for t in range(frames):
             k, total = widest[t], values[p, t] - level if valid[p, t] else np.nan
@@ -81,8 +81,8 @@ def _smooth(
                 for power in range(3):
                     total += windows[k, power, t] * (sums[power, high] - sums[power, low])
             result[p, t] = level + total
-            bent = min(_BENT * left[p, t], variance[p, t])
-            left[p, t] = bent if left[p, t] < variance[p, t] else variance[p, t]
+            bent = min(_BENT * spread[p, t], variance[p, t])
+            spread[p, t] = bent if spread[p, t] < variance[p, t] else variance[p, t]
 
 
 @kernels.compiled
@@ -104,7 +104,7 @@ def _widen(
     noise: float,
     window: int,
     bounds: tuple[Array, Array, Array],
-    left: Array,
+    spread: Array,
     widest: Whole,
 ) -> bool:
     """Intersect confidence intervals (time), in place; return whether any still overlap."""
@@ -114,9 +114,9 @@ def _widen(
         agreeing[t] = agreeing[t] if lower[t] <= upper[t] else 0.0
         remaining += agreeing[t]
         # Where they agree take the window before, if it has less noise.
-        better = (agreeing[t] > 0.0) & (share[t] * noise <= left[t])
+        better = (agreeing[t] > 0.0) & (share[t] * noise <= spread[t])
         widest[t] = window if better else widest[t]
-        left[t] = share[t] * noise if better else left[t]
+        spread[t] = share[t] * noise if better else spread[t]
     return bool(remaining > 0.0)
 
 
