@@ -81,9 +81,9 @@ def equalise(
     variances = excess.max() - excess
     if not variances.any():
         return None
-    # Smooth functions of time hold the object, whose maps have the details that lenses took.
-    measured, every = corrected["counts"], np.ones(corrected.sizes["time"], dtype=bool)
-    functions = misfits.smooth_functions(inputs, every).astype(np.float32)
+    # Smooth functions of time, fitted to the frames with samples, hold the object and its details.
+    measured, frames = corrected["counts"], np.ones(corrected.sizes["time"], dtype=bool)
+    functions = misfits.smooth_functions(inputs, frames).astype(np.float32)
     counts = empty(measured.shape, np.float32)
     maps = np.empty((len(counts), functions.shape[1], *counts.shape[2:]))
     for band, film in enumerate(counts):
@@ -101,18 +101,18 @@ def equalise(
         slope, deviation = inputs.curves[band].reference_slope, float(np.sqrt(variances[band]))
         outside = 1.0 - ndimage.gaussian_filter(np.ones(maps.shape[2:]), deviation, mode="constant")
         of_object = np.stack([maps[band], details[band]], axis=1)
-        for frame, values, at in zip(film, measured.values[band], functions, strict=True):
-            slow, detail = slope * np.tensordot(at, of_object, 1)
+        for frame, values, weights in zip(film, measured.values[band], functions, strict=True):
+            slow, detail = slope * np.tensordot(weights, of_object, 1)
             rapid = _blurred(frame - slow, deviation)
-            error[band] += (outside * rapid / slope) ** 2
             valid = np.isfinite(values) & inputs.good
+            error[band] += valid * (outside * rapid / slope) ** 2
             frame[:] = np.where(valid, slow + detail + rapid, values)
         release()
     # Noise in the smooth functions stays as it was.
-    after = np.array([_noise_after(variance) for variance in variances])
-    noise = (1.0 - after) * functions.shape[1] * inputs.noise**2
+    remaining = np.array([_noise_after(variance) for variance in variances])
+    noise = (1.0 - remaining) * functions.shape[1] * inputs.noise**2
     square = np.square(misfits.object_weights(inputs, result)) * (error.T + noise).T
-    factor = np.sqrt(after) * schema.noise_factor(corrected)
+    factor = np.sqrt(remaining) * schema.noise_factor(corrected)
     capture = corrected.assign(counts=measured.copy(data=counts), noise_factor=("band", factor))
     return Equalised(capture, variances, np.sqrt(square.sum(axis=0) / len(functions)))
 
@@ -164,8 +164,8 @@ def _blurred_maps(maps: Array, variance: float) -> Array:
     """Maps (function, y, x) blurred [pixel^2]; beyond the image they go on as within."""
     deviation = float(np.sqrt(variance))
     reach = 1 + int(4.0 * deviation)
-    around = np.pad(maps, ((0, 0), (reach, reach), (reach, reach)), "reflect", reflect_type="odd")
-    blurred: Array = ndimage.gaussian_filter(around, deviation, axes=(1, 2))
+    extended = np.pad(maps, ((0, 0), (reach, reach), (reach, reach)), "reflect", reflect_type="odd")
+    blurred: Array = ndimage.gaussian_filter(extended, deviation, axes=(1, 2))
     return blurred[:, reach:-reach, reach:-reach]
 
 
