@@ -167,7 +167,8 @@ corrected.zarr -o aligned.zarr
 corrected.zarr --register none --offset 0 -o aligned.zarr
 
 separate steps.separate capture response --correction --corrected-by-camera --register --offset \
-    --method --emissivity --surroundings --outdoors --background-ratio --prior --workers --output
+    --search --method --emissivity --surroundings --outdoors --background-ratio --prior --workers \
+    --output
 separate emission and reflection: temperatures, emissivities, deviations, status
 aligned.zarr response.zarr -o result.zarr
 scene.zarr response.zarr --correction nuc.zarr -o result.zarr

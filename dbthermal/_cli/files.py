@@ -290,16 +290,17 @@ def _unused(options: Namespace) -> dict[str, str]:
     """Options of a command that have no effect, by the reason."""
     if options.command in {"import", "info", "calibrate"}:
         return _of_files(options)
-    if options.command == "align" and options.offset is not None:
-        return {"with --offset": "search"}
+    timed = {"with --offset": "search"} if vars(options).get("offset") is not None else {}
+    if options.command == "align":
+        return timed
     if options.command == "export" and options.output.suffix in NO_TABLES:
         suffix = options.output.suffix
         return {f"with {suffix}": "pixel region variable" if suffix == ".nc" else "pixel region"}
     if options.command != "separate":
         return {}
     if options.correction or options.corrected_by_camera:
-        return {"with --correction or --corrected-by-camera": "method emissivity"}
-    aligned = {"without --correction, for the capture is aligned": "register offset"}
+        return timed | {"with --correction or --corrected-by-camera": "method emissivity"}
+    aligned = {"without --correction, for the capture is aligned": "register offset search"}
     names = "surroundings outdoors background_ratio prior workers"
     later = {"with --method: 'dbthermal complete'": names}
     return aligned | (later if options.method else {"without --method calibrated": "emissivity"})

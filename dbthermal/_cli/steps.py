@@ -320,11 +320,11 @@ def plan(options: Namespace) -> dict[str, Any]:
     if options.outdoors:
         for name, costs in plans["sky_error"].transpose("filter", "material").to_pandas().items():
             numbers[str(name)]["sky_error_K"] = costs.round(4).to_dict()
-    return {"answer": [*_table(numbers, noise, design)], "numbers": numbers}
+    return {"answer": [*_table(numbers, noise, design, plans.attrs["beside"])], "numbers": numbers}
 
 
 def _table(
-    numbers: dict[str, Any], noise: xr.DataArray, design: limits.CaptureDesign
+    numbers: dict[str, Any], noise: xr.DataArray, design: limits.CaptureDesign, beside: str
 ) -> Iterator[str]:
     """Yield the lines of a plan: what it assumes, and a row for each material."""
     filters = [*next(iter(numbers.values()))["object_temperature_std_K"]]
@@ -333,7 +333,7 @@ def _table(
     yield f"Assumed: {design.seconds:g} s at {design.rate:g} Hz; {rises}."
     behind = ", ".join(f"{float(noise.sel(band=name)):.2g} K ({name} um)" for name in filters)
     yield f"Noise of a frame behind a filter: {behind}."
-    yield "Deviation of the object's temperature [K], second band behind the filter [um]:"
+    yield f"Deviation of the object's temperature [K], of band {beside} and a filter [um]:"
     wide = max(len(name) for name in [*numbers, "material"])
     yield "  ".join(["material".ljust(wide), "best", *(name.rjust(8) for name in filters)])
     for name, entry in numbers.items():

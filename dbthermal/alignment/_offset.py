@@ -329,7 +329,7 @@ def _peak(cross: Array, label: str) -> int:
         )
     if abs(lag) == middle - 2:
         peak = f"the largest covariance is at {lag} frames, the end of the search"
-        rule = "Must lie inside: search farther by search= [frame]"
+        rule = "Must lie inside: correct offset=, or search farther by search= [frame]"
         raise ValueError(f"Invalid time offset {label}: {peak}. {rule}.")
     return lag
 

@@ -144,6 +144,7 @@ def reflection_shift(field: xr.Dataset) -> Figure:
     field : Dataset
         From `alignment.reflection_shift`, (axis, y, x) [pixel].
     """
+    schema.check(field, "reflection_shift", label="the field")
     figure, axes = canvas(2, 2, (7.4, 5.6))
     extrapolated = field["shift"].isel(axis=0).notnull() & ~field["known"]
     for row, axis, side in zip(axes, field["axis"].values, ("down", "right"), strict=True):
@@ -387,7 +388,7 @@ def status(result: xr.Dataset) -> Figure:
     >>> [text.get_text() for text in figure.axes[1].get_legend().get_texts()]
     ['75.0 %  no flag', '25.0 %  dead pixel']
     """
-    schema.require(result, xr.Dataset, "result")
+    schema.check(result, "separated", ["status"], "the result")
     codes, shown = legend(result["status"])  # the first flag of each pixel
     image = np.array([to_rgb(color) for _, color, _ in shown])[codes]
     height = 5.2 * codes.shape[0] / codes.shape[1]

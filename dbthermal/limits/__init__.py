@@ -222,7 +222,7 @@ class CaptureDesign:
             _numbers.real_number(name, value, limits.get(name, _numbers.POSITIVE))
         _numbers.real_number("duration [s] within the period", self.duration, (0.0, self.period))
         if not 1.5 <= self.seconds * self.rate <= _MOST_FRAMES:
-            rule = f"Must have two frames to {_MOST_FRAMES}: plan a shorter one, or a lower rate"
+            rule = f"Must have two to {_MOST_FRAMES} frames: change its length, or its rate"
             raise ValueError(f"Invalid capture of {self.seconds} s at {self.rate} 1/s. {rule}.")
 
 

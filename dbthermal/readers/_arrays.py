@@ -152,7 +152,7 @@ def _checked(values: Any, label: str, unit: str) -> dict[str, Any]:
         raise ValueError(f"Invalid dtype {dtype} of '{label}'. {rule}.")
     name = "" if hasattr(values, "stream") else str(getattr(values, "name", ""))  # not of a file
     titles = f"{name.rpartition('/')[2]} {texts['long_name']} {texts['standard_name']}"
-    if named := re.search("temperature|celsius|kelvin", titles, re.IGNORECASE):
+    if named := re.search("temperature|celsius|kelvin|fahrenheit", titles, re.IGNORECASE):
         rule = "Must be counts: if it is, rename the array or its long_name"
         raise ValueError(f"Invalid array of '{label}', named '{named.group()}'. {rule}.")
     ends = [attributes.get("valid_min", 0), attributes.get("valid_max", 2**16 - 1)]

@@ -37,8 +37,8 @@ _LOSSLESS: Final = "LZW, deflate, PackBits, LZMA, Zstandard"
 _AT_ONCE: Final = 2**25  # of a span [byte]
 _TILE: Final = 2**19  # that tiles may have beyond 8 times their image [byte]
 _TEMPERATURES: Final = re.compile(  # unit of values in a description, as of ImageJ or in JSON
-    r"""(?im)\b(?:v|value[ _]?)?units?["']?\s*[:=]\s*["']?(?:[0-9./]+ ?)?"""
-    r"""([cm]?K|C|(?:centi|milli)?kelvins?|(?:deg[a-z]*|\N{DEGREE SIGN})?[ _]*(?:C|celsius))\b"""
+    r"""(?im)\b(?:v|value[ _]?)?units?["']?\s*[:=]\s*["']?(?:[0-9./]+ ?)?([cm]?K|[a-z]*kelvins?|"""
+    r"""(?:deg[a-z]*|\N{DEGREE SIGN})?[ _]*(?:[CF]|celsius|fahrenheit))\b"""
 )
 _NUMBER: Final = r"[0-9]+\.?[0-9]*(?:[eE][+-]?[0-9]+)?"
 _CALIBRATION: Final = re.compile(rf"(?m)^(c[0-9])=(-?{_NUMBER})$")  # polynomial of ImageJ
