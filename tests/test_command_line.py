@@ -487,7 +487,7 @@ def test_plan_and_data(tmp_path: Path) -> None:
     """The plan names the filter for glass; the list has it; an unknown material is refused."""
     _, out, _ = said(tmp_path, "plan", "plate window glass", "brass plate", "--noise", "0.03")
     assert "Assumed: 35 s at 10 Hz; the object rises by 25 K" in out
-    assert re.search(r"(?m)^plate window glass  9.5 +0\.706 +0\.173 ", out)
+    assert re.search(r"8-14 and a filter .*\n.*\nplate window glass  9.5 +0\.706 +0\.173 ", out)
     assert re.search(r"(?m)^brass plate +none .*\n.*Best none: no filter", out)
     still = done(tmp_path, "plan", "brass plate", "--noise", "0.03", "--span", "0")["numbers"]
     assert None in still["brass plate"]["object_temperature_std_K"].values()  # JSON has no infinity
@@ -701,6 +701,7 @@ calibrate --maker a --gain-std 0.01 0.02 -o x -> gain-std --maker
 calibrate --clock 10 -o x ->
 {SWEEP.replace("--bands", "--variable q --bands")} -> variable TIFF
 align corrected.zarr --offset 0 --search 5 -o x.zarr -> search --offset
+separate aligned.zarr response.zarr --search 9 -o x -> search --correction
 separate aligned.zarr response.zarr --method apparent --workers 2 -o x -> workers --met
 separate aligned.zarr response.zarr --emissivity 1 1 -o x -> emissivity --method calibrated
 separate scene.zarr response.zarr --corrected-by-camera --method subspace -o x -> method --corr

@@ -169,7 +169,9 @@ CASES: list[tuple[Call, str]] = [
         lambda: simulation.blackbody_movies(RIG, np.array([280.0]), cast(Any, 1.5), DETECTOR, RNG),
         "frames 1.5",
     ),
-    (lambda: figures.status(NOTHING), "Invalid result of type NoneType"),
+    (lambda: figures.status(RESULT.astype(float)), "'status' of the result.*mask, average or fill"),
+    (lambda: figures.reflection_shift(RESULT), "Missing variable 'shift' in the field"),
+    (lambda: rows(frames=APPARENT[0]), r"Invalid dims \('time', 'y', 'x'\) of the inputs"),
     (lambda: store.save_figure(NOTHING, "a.png", {}), "Invalid figure of type NoneType"),
     (lambda: store.provenance(cast(Any, [1])), "Invalid parameters of type list"),
     (lambda: store.save(CAPTURE, "a.zarr", {"a": np.nan}), "Invalid parameter 'provenance'"),
@@ -335,10 +337,14 @@ def film(emission: xr.DataArray = OBJECT, change: xr.DataArray = CHANGE) -> list
     return list(drawings.scenes.separated_film(*parts, title="a"))
 
 
-def rows(emission: xr.DataArray = OBJECT, change: xr.DataArray = CHANGE) -> Any:
+def rows(
+    emission: xr.DataArray = OBJECT,
+    change: xr.DataArray = CHANGE,
+    frames: xr.DataArray = APPARENT,
+) -> Any:
     """A figure of two frames."""
     labels = ("a [K]", "b [K]", "c [K]")
-    parts = (few(APPARENT), few(emission), few(change))
+    parts = (few(frames), few(emission), few(change))
     return figures.separated_frames(*parts, title="plate", labels=labels)
 
 

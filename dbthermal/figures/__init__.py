@@ -74,6 +74,8 @@ def separated_frames(
     title, labels : str, tuple of str
         Name of the scene; labels with units of inputs, emission and reflection.
     """
+    form = schema.STAGES["corrected"]["counts"]  # of any unit
+    schema.check_variable(inputs.drop_attrs(), form, "the inputs")
     emission = laid_on(emission, inputs, "the emission", "the inputs")
     reflection = laid_on(reflection, inputs, "the reflection", "the inputs")
     bands, frames = inputs["band"].values, inputs.sizes["time"]

@@ -172,7 +172,7 @@ def _seconds(line: Any, frames: int, clock: Clock | None, label: str, path: Path
     _check_whole(times, path)
     if (moments := _moments(times)) is None:
         return None
-    unit = "s" if times.dtype.kind in "OSU" else _attribute(times, "units")
+    unit = "s" if times.dtype.kind in "OSUM" else _attribute(times, "units")
     unit = unit or (re.search("_(s|ms|us|ns)$", str(name).lower()) or ("", ""))[1]  # by its name
     return _recording.check_times(moments, str(unit), clock, label)
 
@@ -224,10 +224,10 @@ def _attribute(values: Any, name: str) -> Any:
 
 def _moments(times: Any) -> npt.NDArray[Any] | None:
     """Times as numbers or dates, dates in text as seconds; None for other text."""
-    if times.dtype.kind in "iufmM":
+    if times.dtype.kind in "iufmM" and isinstance(times.dtype, np.dtype):  # of pandas, with a zone
         return np.asarray(times[...]).reshape(-1)
     seconds = list[float]()
-    for number in range(times.size) if times.dtype.kind in "OSU" and times.ndim == 1 else ():
+    for number in range(times.size) if times.dtype.kind in "OSUM" and times.ndim == 1 else ():
         text = times[number]  # of any length: in memory one by one
         text = text.decode(errors="replace") if isinstance(text, bytes) else str(np.asarray(text))
         try:

@@ -16,6 +16,7 @@ import google_crc32c
 import h5py
 import numcodecs
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 import zarr
@@ -270,6 +271,8 @@ def test_dates_of_an_array_agree_with_the_clock() -> None:
     array = xr.DataArray(scene(), dims=("time", "y", "x"))
     steps = np.arange(3) * np.timedelta64(100, "ms")
     read(array.assign_coords(time=np.datetime64("2020-01-01", "ns") + steps))
+    zoned = pd.date_range("2026-03-29 01:59:59.8", periods=3, freq="100ms", tz="Europe/Berlin")
+    read(array.assign_coords(time=("time", zoned)))
     with pytest.warns(UserWarning, match="Times 'time' of 'array' are another text"):
         read(array.assign_coords(time=["a", "b", "c"]))
     with pytest.raises(ValueError, match=r"frame 1 at 0\.3 s, by clock= at 0\.1"):
