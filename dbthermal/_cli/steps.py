@@ -50,7 +50,7 @@ dbthermal separate scene.zarr response.zarr --correction nuc.zarr{views} -o resu
 dbthermal report result.zarr -o report.html
 dbthermal explore result.zarr -o look.ipynb"""
 """At most five, that take the files to a report and to the explorer."""
-_SCENE: Final = (
+_SCENE: Final = (  # of the files, an origin that `readers.tiff` takes over
     "simulated, by no camera: a plate of glass (left) and concrete (right) with a cross of black "
     "tape, its middle heated from 22 to 60 degC while people walk by"
 )
@@ -70,10 +70,9 @@ def demo(options: Namespace) -> dict[str, Any]:
     for path in (path for path in paths if path.exists()):
         raise FileExistsError(f"There is something at '{path}'. Must be a new folder.")
     folder.mkdir(parents=True, exist_ok=True)
-    about = f"origin: {_SCENE}"  # which `readers.tiff` takes over
     for path, stack in paths.items():
-        with store.whole(path, ".tif") as draft:
-            tifffile.imwrite(draft, stack, photometric="minisblack", description=about)
+        with store.whole(path, ".tif") as file:
+            tifffile.imwrite(file, stack, photometric="minisblack", description=f"origin: {_SCENE}")
     sweep = " ".join(f"--at {step}C a{step}.tif b{step}.tif" for step in _CELSIUS)
     views = " --register translation" if options.side_by_side else " --register none --offset 0"
     commands = [f"cd {quote(str(folder))}", *_NEXT.format(sweep=sweep, views=views).splitlines()]
@@ -229,7 +228,6 @@ def _aligning(options: Namespace, capture: xr.Dataset) -> dict[str, Any]:
 
 def separate(options: Namespace) -> dict[str, Any]:
     """Command `separate`."""
-    # Inputs of the stages that the way needs.
     is_raw = bool(options.correction or options.corrected_by_camera)
     stages = {"capture": "capture|corrected" if is_raw else "corrected", "response": "response"}
     stages |= {"correction": "correction"} if options.correction else {}

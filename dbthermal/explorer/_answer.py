@@ -49,10 +49,8 @@ def answer(result: xr.Dataset, materials: xr.Dataset | None = None) -> tuple[lis
         sentences.append(f"{name} from {low:.1f} to {high:.1f} degC, {typical}.")
     else:
         sentences.append("No object temperature at any pixel.")
-    # Shares of the pixels.
     remainder = f"completed, not measured: {completed.mean():.0%}"
     sentences.append(f"Measured: {measured.mean():.0%} of the pixels; {remainder}.")
-    # Materials, and what to watch out for.
     numbers["materials"] = listed = by_material(result, measured, table)
     for entry in listed:
         columns = (entry[key].values() for key in _EMISSIVITIES)

@@ -74,8 +74,7 @@ def separated_frames(
     title, labels : str, tuple of str
         Name of the scene; labels with units of inputs, emission and reflection.
     """
-    form = schema.STAGES["corrected"]["counts"]  # of any unit
-    schema.check_variable(inputs.drop_attrs(), form, "the inputs")
+    schema.check_variable(inputs.drop_attrs(), schema.STAGES["corrected"]["counts"], "the inputs")
     emission = laid_on(emission, inputs, "the emission", "the inputs")
     reflection = laid_on(reflection, inputs, "the reflection", "the inputs")
     bands, frames = inputs["band"].values, inputs.sizes["time"]
@@ -399,7 +398,6 @@ def status(result: xr.Dataset) -> Figure:
     map_axis.imshow(image, interpolation="nearest")
     map_axis.set(xticks=[], yticks=[])
     legend_axis.set_axis_off()
-    # Legend with shares.
     patches = [
         Patch(facecolor=color, edgecolor="0.5", label=f"{drawing.percent(share)}  {words}")
         for words, color, share in shown

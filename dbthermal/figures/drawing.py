@@ -46,14 +46,15 @@ def canvas(
 
 
 def band_label(name: object) -> str:
-    """Label of a band with its unit, such as "9.5 um" with a micro sign.
+    """Label of a band: of wavelengths with their unit, a micro sign in "9.5 um"; else its name.
 
     Parameters
     ----------
     name : object
         Name of the band.
     """
-    return f"{name} \N{MICRO SIGN}m"
+    is_free = str(name).strip("0123456789.-")  # names of bands are free, such as "wide"
+    return str(name) if is_free else f"{name} \N{MICRO SIGN}m"
 
 
 def provenance_note(data: xr.Dataset | xr.DataArray) -> str:

@@ -123,6 +123,15 @@ def test_nothing_but_nan(name: str) -> None:
     assert figure.axes
 
 
+def test_labels_of_bands() -> None:
+    """Wavelengths have their unit; a free name of a band is none."""
+    assert [*map(drawing.band_label, ("8-14", 9.5, "wide"))] == [
+        "8-14 \N{MICRO SIGN}m",
+        "9.5 \N{MICRO SIGN}m",
+        "wide",
+    ]
+
+
 def test_celsius_on_the_axes() -> None:
     """Kelvin go in, degrees Celsius are drawn."""
     image = draw_temperatures().axes[0].images[0].get_array()
