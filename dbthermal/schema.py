@@ -359,7 +359,7 @@ def has_flag(flags: xr.DataArray, *names: str) -> xr.DataArray:
     """
     meanings = str(flags.attrs.get("flag_meanings", "")).split()
     masks = dict(zip(meanings, np.atleast_1d(flags.attrs.get("flag_masks", [])), strict=True))
-    if unknown := [name for name in names if name not in masks]:
+    if unknown := [name for name in names if str(name) not in masks]:
         raise ValueError(f"Unknown flag '{unknown[0]}'. Must be one of {meanings}.")
     mask = sum({int(masks[name]) for name in names})
     return flags.copy(data=(flags.values & flags.dtype.type(mask)) != 0).drop_attrs()
