@@ -244,8 +244,9 @@ def test_info_of_stores_and_files(results: Path) -> None:
         assert [*cameras] == ["a.tif", "b.tif"]
         assert cameras["b.tif"]["frame_rate_Hz"] == pytest.approx(12)
     assert len(done(results, "info", "scene.zarr", "scene.zarr")) == 2  # none is left out
-    stages = [it["stage"] for it in done(results, "info", "nuc.zarr", "scene.zarr").values()]
-    assert stages == ["correction", "capture"]
+    for names in (["nuc.zarr", "scene.zarr"], ["nuc.zarr", "scene.zarr", "response.zarr"]):
+        stages = [it["stage"] for it in done(results, "info", *names).values()]
+        assert stages == ["correction", "capture", "response"][: len(names)]
 
 
 @pytest.mark.parametrize("option", [[], ["--side-by-side"]])
@@ -603,7 +604,7 @@ import two.npz --bands a b -o x.zarr -> Invalid 1 files .* twice, with --variabl
 import two.npz two.npz --bands a b -o x.zarr -> one of the arrays .--variable. .* one of .'a', 'b'.
 separate a.tif response.zarr -o x.zarr -> No dataset 'a.tif'. Must be a zarr folder, as from: dbth
 import response.zarr -o x.zarr -> of stage 'response'. Must be of stage 'capture'
-info result.zarr scene.zarr nuc.zarr -> Invalid list of 3 arrays. Must be joined in a file
+info two.npz two.npz two.npz --clock 9 -> Invalid list of 3 arrays. Must be joined in a file
 info a.tif b.tif five.tif --clock 10 -> Unordered files: .* Must be of one camera, and rise
 record a.tif new -> Invalid session 'a.tif'. Must be YAML, as params/sessions/scene.yaml.
 record folder new -> Invalid session 'folder'. Must be YAML

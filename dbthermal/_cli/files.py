@@ -242,8 +242,8 @@ def provenance(options: Namespace) -> dict[str, Any]:
 
 
 def info(options: Namespace) -> dict[str, Any]:
-    """Command `info`."""
-    cameras = _cameras(options.files)
+    """Command `info`; it describes each of several stores."""
+    cameras = _cameras(options.files, options.files if all(map(_is_store, options.files)) else "ab")
     keys = [f"{it[0]}{f' ({n + 1})' * (cameras.count(it) > 1)}" for n, it in enumerate(cameras)]
     return {key: _described(cameras[n], options, n) for n, key in enumerate(keys)}
 
