@@ -74,7 +74,8 @@ def separated_frames(
     title, labels : str, tuple of str
         Name of the scene; labels with units of inputs, emission and reflection.
     """
-    schema.check_variable(inputs.drop_attrs(), schema.STAGES["corrected"]["counts"], "the inputs")
+    if inputs.dims != (dims := schema.STAGES["corrected"]["counts"].dims):
+        raise ValueError(f"Invalid dims {inputs.dims} of the inputs. Must be {dims}.")
     emission = laid_on(emission, inputs, "the emission", "the inputs")
     reflection = laid_on(reflection, inputs, "the reflection", "the inputs")
     bands, frames = inputs["band"].values, inputs.sizes["time"]
@@ -276,7 +277,6 @@ def live(panels: Mapping[str, Panel], *, title: str, foot: str = "") -> Figure:
         draw_image(figure, axis, image, heading, label, cmap=cmap, limits=panel.limits)
         bar = axis.images[0].colorbar
         bar.locator, bar.formatter = MaxNLocator(_TICKS, integer=True), ScalarFormatter()
-        # Texts below and across the picture.
         axis.set_xlabel(panel.text, loc="left", fontsize=9)
         if panel.warning:
             place: dict[str, Any] = {"transform": axis.transAxes, "va": "top", "fontsize": 9}
