@@ -49,7 +49,7 @@ def answer(result: xr.Dataset, materials: xr.Dataset | None = None) -> tuple[lis
         sentences.append(f"{name} from {low:.1f} to {high:.1f} degC, {typical}.")
     else:
         sentences.append("No object temperature at any pixel.")
-    if measured.any() and result.attrs.get("surroundings_source") == "capture":
+    if result.attrs.get("surroundings_source") == "capture":
         level = f"Reflected surroundings at {result.attrs['surroundings'] - zero_Celsius:.1f} degC"
         sentences.append(f"{level}: if they were far from it, a calibration is wrong.")
     remainder = f"completed, not measured: {completed.mean():.0%}"

@@ -102,6 +102,11 @@ def test_a_gray_scene_tells_little_of_the_room(gray: float) -> None:
     apart = whole.attrs["surroundings"] - ROOM
     assert held(whole, scene, "background_temperature") > 0.8
     assert abs(apart) < 3.0 * whole.attrs["surroundings_std"]
+    assert whole.attrs["surroundings_source"] == "capture"
+    dead = np.full(alone["status"].shape, int(Status.DEAD_PIXEL), np.uint32)
+    blind = capture.assign(status=(("y", "x"), dead))
+    nothing = separation.complete(separation.solve(blind, RESPONSE), blind, RESPONSE)
+    assert nothing.attrs["surroundings_source"] == "assumed"
 
 
 @pytest.mark.parametrize("emissivities", [(0.95, 0.85), (0.98, 0.95), (0.92, 0.90), (0.86, 0.72)])

@@ -89,7 +89,7 @@ def complete(  # noqa: PLR0913 - all that is known beside the capture, by name
         and in frames of which no pixel has data of all bands (attribute `frames_missing`, their
         number); a sample that a pixel alone lacks is bridged from those around it: `bridged`
         (time, y, x) says which, and leaves no bit (`frames_bridged`, their mean number).
-        Attributes `surroundings`, `surroundings_std` [K] and `surroundings_source`.
+        Attributes `surroundings`, `surroundings_std` [K], `surroundings_source` ("assumed": 22 C).
 
     Raises
     ------
@@ -174,6 +174,7 @@ def filled(
         level = scenes.stated(scene, context.surroundings, context.surroundings_std)
         seen = scenes.find_level(replace(scene, level=level), sample)
         level = replace(seen, signal=level.signal, std=level.std)
+    source = "capture" if np.any(level.std != scene.level.std) else "assumed"
     scene = replace(scene, level=level)
     del sample  # before the blocks take memory
     lacking = empty(result[FILMS[0]].shape, np.bool_)  # samples of a result without a film
@@ -191,7 +192,7 @@ def filled(
         frames_bridged=float(number.sum() / max(1, np.count_nonzero(number))),
         surroundings=float(np.mean(curve.temperature(np.asarray(level.signal) + curve.reference))),
         surroundings_std=float(np.mean(level.std)),
-        surroundings_source="capture" if context.surroundings is None else "stated",
+        surroundings_source=source if context.surroundings is None else "stated",
     )
 
 
@@ -315,7 +316,6 @@ def _bridge_rows(completed: xr.Dataset, frames: Mask, lacking: Mask, rows: slice
     bridged, status = lacking[:, rows], completed["status"].values[rows]
     bridged &= np.isfinite(completed[FILMS[0]].values[:, rows])
     bridged &= (status & np.uint32(schema.COMPLETED & ~Status.COMPLETED_FRAMES)) == 0
-    # A pixel that lacked too many frames gets a bit of the status, too.
     mostly = bridged.mean(axis=0) >= quality.MOST_BRIDGED
     status |= mostly * np.uint32(Status.COMPLETED_FRAMES)
     if "bridged" in completed:
