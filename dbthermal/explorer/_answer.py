@@ -51,7 +51,7 @@ def answer(result: xr.Dataset, materials: xr.Dataset | None = None) -> tuple[lis
         sentences.append("No object temperature at any pixel.")
     if result.attrs.get("surroundings_source") == "capture":
         level = f"Reflected surroundings at {result.attrs['surroundings'] - zero_Celsius:.1f} degC"
-        sentences.append(f"{level}: if they were far from it, a calibration is wrong.")
+        sentences.append(f"{level}; a calibration is wrong if that is far off.")
     remainder = f"completed, not measured: {completed.mean():.0%}"
     sentences.append(f"Measured: {measured.mean():.0%} of the pixels; {remainder}.")
     numbers["materials"] = listed = by_material(result, measured, table)
