@@ -160,17 +160,16 @@ def bars(model: Model, record: Any, line: Line, work: Work, covariance: Any) -> 
         total += weights[t]
         product += weights[t] * emitted[t]
         reflected += z[t] - emitted[t]
-    for t in range(z.size):
-        kernel[t] = weights[t] * (emitted[t] - product / total) / line.energy
-    first = work.emissivity[0]
-    noise_variance = line.variance
-    noise_variance += first**2 * _curve_variance(model, kernel, count, null, work)
+    first, noise_variance, drift_variance = work.emissivity[0], work.material[2], work.material[3]
     walk, upper = _walk(model, first**2 * null, count, work)
-    limit = (1.0 - first) * model.drift
-    linear = _linear(model, record, line, limit, work)
-    drift_variance = (limit / kernels.range_of(emitted)) ** 2 + max(upper, linear)
-    if line.known:
-        noise_variance, drift_variance = work.material[2], work.material[3]
+    if not line.known:
+        for t in range(z.size):
+            kernel[t] = weights[t] * (emitted[t] - product / total) / line.energy
+        noise_variance = line.variance
+        noise_variance += first**2 * _curve_variance(model, kernel, count, null, work)
+        limit = (1.0 - first) * model.drift
+        linear = _linear(model, record, line, limit, work)
+        drift_variance = (limit / kernels.range_of(emitted)) ** 2 + max(upper, linear)
     # Rapid changes have the ratios k_m u_m'(y) / u_1'(y), and y is known as well as e_1, in the
     # mean over time, dy = (u_1(y) - u_1(x)) de_1 / (1 - e_1); or as any temperature calibrated.
     level = abs(reflected / z.size) * sqrt(noise_variance + walk) / (1.0 - first) ** 2

@@ -344,16 +344,18 @@ def emission(model: Model, record: Any, work: Work, rounds: int) -> Line:
     kernels.blackbody(first, temperature, work.emitted, work.spare)
     kernels.fill(work.lack, 1.0)
     guess = regression.moments(work.emitted, z, work.lack)[0]
-    emissivity = guess if 0 < guess < 1 else middle
-    fixed = record.pooled and not np.isnan(material[1] + material[2])
-    constant = False
+    fixed, constant = record.pooled and not np.isnan(material[1] + material[2]), False
+    emissivity = guess if 0 < guess < 1 and not fixed else middle
     slope, variance, scale, energy = 0.0, 0.0, 0.0, 0.0
-    before, slope_before = np.nan, np.nan
+    before, slope_before, again = np.nan, np.nan, rounds > 0
     for turn in range(ROUNDS):
         _approach(model, emissivity, work, work.emitted)
+        if fixed and turn < ROUNDS - 1:  # the line is for its residual alone
+            continue
         slope, variance, scale, energy = regression.regress(
-            work.emitted, z, work.noise[0], weights, work.residual, work.few, rounds + turn > 0
+            work.emitted, z, work.noise[0], weights, work.residual, work.few, again
         )
+        again = True
         constant = energy < OBJECT_TO_NOISE * count * record.null_variance and not fixed
         rate = (slope - slope_before) / (emissivity - before)
         before, slope_before = emissivity, slope
