@@ -350,15 +350,13 @@ def drift(inputs: Inputs, result: xr.Dataset, reading: Reading) -> list[tuple[Ar
     equations = []
     for place, ratio in enumerate(ratios[1:], 1):
         used = binary_erosion(pixels & (ratio > 0.0), border_value=1)
-        second, forms, forces = rapid(place, at), list[Array](), list[Array]()
-        for columns in np.array_split(np.arange(ratio.shape[1]), _WINDOWS):
-            y, x = np.nonzero(used[:, columns])
-            window = y, columns[x]
-            slope, kappa = slopes[:, :, *window], ratio[window]
-            remainder = second[:, *window] / kappa - first[:, *window]
-            weighted = slope / (noise[0] + noise[place] / kappa**2)
-            form = np.einsum("atp,btp->tab", weighted, slope, optimize=True)
-            force = np.einsum("atp,tp->ta", weighted, remainder)
+        kappa, forms, forces = np.where(used, ratio, 1.0), list[Array](), list[Array]()
+        weighted = slopes * (used / (noise[0] + noise[place] / kappa**2))
+        every = weighted, slopes, rapid(place, at) / kappa - first
+        for parts in zip(*(np.array_split(it, _WINDOWS, axis=-1) for it in every), strict=True):
+            pull, slope, remainder = (it.reshape(*it.shape[:-2], -1) for it in parts)
+            form = pull.swapaxes(0, 1) @ slope.transpose(1, 2, 0)
+            force = np.einsum("atp,tp->ta", pull, remainder)
             forms.append(np.einsum("tj,tk,tab->jakb", course, course, form, optimize=True))
             forces.append(np.einsum("tj,ta->ja", course, force))
         size = course.shape[1] * 3
