@@ -19,13 +19,13 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 from scipy.ndimage import uniform_filter
-from scipy.sparse import csr_array
 from scipy.special import chdtr, chdtri
 
 from dbthermal import _smooth as smooth
 from dbthermal import schema
 from dbthermal._arrays import Array, Mask, quotient, release, stretches
 from dbthermal.separation import _tiles as tiles
+from dbthermal.separation._apart import planes
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._quality import MOST_BRIDGED
 from dbthermal.separation._subspace.fused import FILMS
@@ -47,7 +47,6 @@ _OF_ALL: Final = float(chdtr(3, chdtri(1, 1.0 - _STEADY))) / _STEADY
 _MOVING: Final = 3.0  # variance of a reflection's changes in an event over their noise
 # Octaves of time in smooth functions, for the octave that is seen: 1/f noise is alike in all.
 _OCTAVES: Final = float(np.log2(smooth.HIGHEST_ORDER))
-_NODES: Final = np.linspace(-1.0, 1.0, 4)  # of a cubic polynomial over the object's range
 
 
 class Reading(NamedTuple):
@@ -175,39 +174,41 @@ def _of_rows(
     shape = -(-pixels.size // width // _BLOCK), -(-width // _BLOCK)
     row, column = np.divmod(np.arange(pixels.size), width)
     place = np.where(pixels, row // _BLOCK * shape[1] + column // _BLOCK, -1)
-    number = np.bincount(place[pixels], minlength=shape[0] * shape[1]).astype(np.float64)
+
+    def summed(film: Array) -> Array:
+        image = film.reshape(len(film), -1, width)
+        for axis in (1, 2):
+            image = np.add.reduceat(image, range(0, image.shape[axis], _BLOCK), axis=axis)
+        return np.asarray(image.reshape(len(film), -1))
+
+    number = summed(1.0 * pixels[np.newaxis])[0]
     # Weigh the bands, and average what is left beside the object, and the reflection.
-    weights, noise = _weights(np.where(pixels, ratio, 0.5), inputs.noise[inputs.bands, None] * gain)
+    deviation = inputs.noise[inputs.bands, np.newaxis] * gain
+    terms = _weights(np.where(pixels, ratio, 0.5), deviation)
+    weights, noise = (np.where(pixels, term, 0.0) for term in terms)
     # A span of time is an octave beyond the smooth functions, half of an event.
     length = _length(frames.size)
     event, half = np.divmod(np.flatnonzero(frames), length)
     span = np.unique(2 * event + (2 * half >= length), return_inverse=True)[1]
     sums = np.zeros((2, signals.shape[1], number.size))
-    every, size = np.flatnonzero(pixels), (pixels.size, number.size)
-    summing, *weighing = (
-        csr_array((it[pixels], (every, place[pixels])), shape=size)
-        for it in (np.ones(pixels.size), *weights)
-    )
     for chunk in stretches(signals[0]):
-        sums[0, chunk] = sum(it[chunk] @ w for it, w in zip(reflections, weighing, strict=True))
-        sums[1, chunk] = signals[0][chunk] @ summing
+        sums[0, chunk] = summed(np.einsum("btp,bp->tp", reflections[:, chunk], weights))
+        sums[1, chunk] = summed(signals[0, chunk] * pixels)
     single = _single_pixels(inputs, signals, weights, frames, place, number.size)
     release()
     filled = np.maximum(number, 1.0)
-    noise = np.stack([np.bincount(place[pixels], it[pixels], number.size) for it in noise])
     # Take the smooth functions out, and sum over means and events.
     basis = smooth_functions(inputs, frames)
-    noise, sums = noise / filled**2, sums / filled
+    noise, sums = summed(noise) / filled**2, sums / filled
     remainder, reflection = sums - basis @ (basis.T @ sums)
-    weights = np.stack([np.bincount(place[pixels], it[pixels], number.size) for it in weights])
-    levels = _levels(weights / filled, noise[0], remainder, frames, shape)
+    levels = _levels(summed(weights) / filled, noise[0], remainder, frames, shape)
     # Deviations of objects in pieces of time hold a part already.
     stated, start = np.zeros(pixels.size), rows.start * width
     divided = pixels & inputs.division[:, start : start + pixels.size].any(axis=0)
     if divided.any():
         film = result["object_temperature_std"].values[:, rows].reshape(-1, pixels.size)
         stated[divided] = np.nanmean(np.square(film[:, divided]), axis=0)
-    stated = np.bincount(place[pixels], stated[pixels], number.size) / filled
+    stated = summed(stated[np.newaxis])[0] / filled
     if inputs.displacement is not None or np.any(schema.noise_factor(inputs.capture) < 1.0):
         jumps = np.diff(remainder, 2, axis=0)  # neighbours share noise
         noise[0] = np.maximum(noise[0], np.mean(jumps**2, axis=0) / 6.0)
@@ -263,7 +264,7 @@ def _single_pixels(
         values = np.zeros((len(segment), middle.size))
         for pixels, share in ((middle - 1, -1.0), (middle, 2.0), (middle + 1, -1.0)):
             for film, weight in zip(signals, weights, strict=True):
-                values += share * weight[pixels] * film[:, pixels]
+                values += share * weight[pixels] * film.take(pixels, axis=1)
         means = values[: segments.size].reshape(*segments.shape, -1).mean(axis=1)
         return [variance(means, segments), variance(values, segment[:, np.newaxis]) / length]
 
@@ -311,20 +312,10 @@ def reflected(inputs: Inputs, result: xr.Dataset, rows: slice) -> Reading:
     finite = np.isfinite(film)
     pixels &= np.mean(finite, axis=0) > 1.0 - MOST_BRIDGED
     film = film if finite.all() else smooth.bridge(film, pixels)
-    lowest, highest = film.min(axis=0), film.max(axis=0)
-    center, half = 0.5 * (lowest + highest), np.maximum(0.5 * (highest - lowest), 1.0)
-    # The object's signal is a cubic polynomial of its temperature, over its range in each pixel.
-    nodes, powers = center + _NODES[:, np.newaxis] * half, np.vander(_NODES, increasing=True)
-    reflections = signals.copy()
-    for order, band in enumerate(inputs.bands):
-        curve = inputs.curves[band]
-        emitted = curve.signal(np.where(pixels, nodes, curve.reference)) - curve.reference
-        shares = np.linalg.solve(powers, emissivity[order] * emitted)
-        for chunk in stretches(reflections[order]):
-            within, emission = (film[chunk] - center) / half, 0.0
-            for share in shares[::-1]:
-                emission = emission * within + share
-            reflections[order, chunk] -= np.where(pixels, emission, 0.0)
+    reflections, shares = signals.copy(), np.where(pixels, emissivity, np.nan).astype(np.float64)
+    responses = planes.responses_of(tuple(inputs.curves[band] for band in inputs.bands))
+    planes.emit(film, responses)
+    planes.without_object(reflections, film, shares, responses)
     return Reading(rows, signals, reflections, frames, pixels, gain)
 
 

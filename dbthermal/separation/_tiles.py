@@ -293,7 +293,7 @@ def cut(
         counts, usable, valid, status, gain = sampled(window, selected)
         for patch, places, within, chosen in patches:
             # A tile's own samples lie together: rows of a large film are far apart in memory.
-            signals = np.ascontiguousarray(counts[..., within])
+            signals = np.ascontiguousarray(counts[..., within], dtype=np.float64)
             bridged, flags = np.ascontiguousarray(usable[:, within]), status[within]
             if method.whole_image or method.every_frame:
                 sets = quality.common_frames(signals, bridged, flags, method.minimum_frames)

@@ -206,7 +206,7 @@ def paired(
     pixels = selected if resampled.packed is None else slice(None)
     first = capture["counts"].isel(band=displacement.reference, y=rows).values
     first, second = first.reshape(len(first), -1)[:, pixels], resampled.counts[..., pixels]
-    valid, counts = np.ones(first.shape, dtype=bool), np.empty((bands, *first.shape))
+    valid, counts = np.ones(first.shape, dtype=bool), np.empty((bands, *first.shape), first.dtype)
     counts[displacement.reference], counts[displacement.others] = first, second
     counts[..., quality.unusable(resampled.status[pixels])] = 0.0
     if resampled.packed is not None:

@@ -129,17 +129,17 @@ def _survey(
     scatters: Scatters, per_pixel: xr.Dataset, noise: Array, places: npt.NDArray[np.intp]
 ) -> Survey:
     """Survey of some pixels by their planes, without scatter where the model is not sound."""
-    status = per_pixel["status"].values.ravel()[places]
+    status, scatters = per_pixel["status"].values.ravel()[places], scatters.select_pixels(places)
     emissivity = per_pixel["emissivity"].sel(band=per_pixel.attrs["reference_band"]).values
     value = np.where((status & ~LOW) == 0, emissivity.ravel()[places], np.nan)
-    sound = ((status & BROKEN) == 0) & ~scatters.apart[places]
-    scale = scatters.noise[:, places] / noise[:, np.newaxis]  # whitened by the noise of samples
-    scatter = np.where(sound, scatters.scatter[..., places] * scale * scale[:, np.newaxis], 0.0)
-    frames = np.where(sound, scatters.freedom[places], 0.0)
+    sound = ((status & BROKEN) == 0) & ~scatters.apart
+    scale = scatters.noise / noise[:, np.newaxis]  # whitened by the noise of samples
+    scatter = np.where(sound, scatters.scatter * scale * scale[:, np.newaxis], 0.0)
+    frames = np.where(sound, scatters.freedom, 0.0)
     return Survey(
         scatter=np.stack([scatter] * 3),
         frames=np.stack([frames] * 3),
-        ratio=scatters.ratio[:, places],
+        ratio=scatters.ratio,
         null_weights=np.zeros((len(noise), places.size)),
         emissivity=value,
         noise_variance=np.ones(places.size),

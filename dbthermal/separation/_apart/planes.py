@@ -11,6 +11,7 @@ they are, and a map of each product is blurred at once, not a film.
 
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -20,7 +21,7 @@ from numpy.polynomial import Polynomial
 
 from dbthermal import _smooth as smooth
 from dbthermal import schema
-from dbthermal._arrays import Array, Mask, release
+from dbthermal._arrays import Array, Mask, release, select
 from dbthermal._compiled import compiled
 from dbthermal.response import Curve
 from dbthermal.separation import _quality as quality
@@ -29,6 +30,7 @@ from dbthermal.separation._apart import equations as system
 from dbthermal.separation._apart.relaxation import Floats
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._subspace import reflection_ratio
+from dbthermal.separation._subspace.kernels import polynomial
 
 TAIL: Final = 3.0
 """Deviations of the blur beyond which it has no weight."""
@@ -43,7 +45,7 @@ _APART: Final = 8.0
 
 
 @dataclass(frozen=True)
-class Scatters:
+class Scatters(tiles.Pixels):
     """Scatter of the reflected signals of each pixel, and their noise."""
 
     scatter: Array  # whitened, less that of the noise (band, band, pixel) [1]
@@ -150,14 +152,16 @@ class Planes:
 def project(inputs: Inputs, result: xr.Dataset, emissivity: Floats, threads: Executor) -> Planes:
     """Planes of a capture, by the object in a result of it and emissivities (band, pixel) [1]."""
     bands, (height, width) = inputs.bands, result["status"].shape
-    rapid, columns = _functions(inputs), system.smooth_functions(inputs.capture)
+    assert inputs.displacement is not None
+    rapid = inputs.displacement.once("rapid", partial(_functions, inputs))
+    columns = system.smooth_functions(inputs.capture)
     maps = np.zeros((len(bands), rapid.shape[1], height, width), np.float32)
     straight = np.zeros((len(bands), columns.functions.shape[1], height * width), np.float32)
     noise, freedom = np.ones((2, len(bands), height, width)), np.ones((height, width))
     usable = np.zeros((height, width), dtype=bool)
     bend = np.zeros((len(bands), height * width))
     noise[1] = (inputs.noise / schema.noise_factor(inputs.capture))[bands, None, None]
-    response = _response(tuple(inputs.curves[band] for band in bands))
+    responses = responses_of(tuple(inputs.curves[band] for band in bands))
     film = result["object_temperature"].values.reshape(len(rapid), -1)
 
     def block(rows: slice) -> None:
@@ -169,20 +173,19 @@ def project(inputs: Inputs, result: xr.Dataset, emissivity: Floats, threads: Exe
                 slow = columns.functions[frames]
                 inverse = np.linalg.solve(slow.T @ slow, slow.T)
                 quick = rapid[frames] - slow @ (inverse @ rapid[frames])
-                x = film[:, places] if frames.all() else film[np.ix_(frames, places)]
+                emitted = select(film, places) if frames.all() else film[np.ix_(frames, places)]
+                emit(emitted, responses)
                 shares = emissivity[:, places].astype(np.float64)
-                emitted = np.empty(x.shape, np.float32)
-                _emit(np.asarray(x, np.float32), response, emitted)
                 inverse, quick = inverse.astype(np.float32), quick.astype(np.float32)
                 signals = np.ascontiguousarray(tile.signals, np.float32)
-                bend[:, places] = _straighten(signals, emitted, shares, response)
+                bend[:, places] = _straighten(signals, emitted, shares, responses)
                 for band, signal in enumerate(signals):
                     straight[band][:, places] = inverse @ signal
                 if inputs.difference is not None:
                     more = inputs.difference(places)[:, frames]
                     for band, changes in enumerate(more, 1):
                         straight[band][:, places] += inverse @ changes
-                _without_object(signals, emitted, shares, response)
+                without_object(signals, emitted, shares, responses)
                 for band, signal in enumerate(signals):
                     maps[band][:, row, column] = quick.T @ signal
                 noise[0][:, row, column] = tile.scaled(tile.noise)
@@ -195,30 +198,27 @@ def project(inputs: Inputs, result: xr.Dataset, emissivity: Floats, threads: Exe
 
 
 class Response(NamedTuple):
-    """Responses of the bands, as polynomials."""
+    """Responses of the bands, as polynomials of ten rising coefficients."""
 
-    series: Array  # signal of the first less the reference [K], of temperatures over the range
+    series: tuple[float, ...]  # signal of the first less the reference [K], over the range
     middle: float  # of the range [K]
     half: float
-    bends: Array  # coefficients of u_m - u_1 in u_1 less the reference (band - 1, degree) [K]
+    bends: Floats  # of u_m - u_1 by u_1 less the reference (band, 10) [K]
 
 
 @compiled
-def _polynomial_at(series: Array, place: float) -> float:
-    """Polynomial of rising coefficients."""
-    value = series[series.size - 1]
-    for degree in range(series.size - 2, -1, -1):
-        value = value * place + series[degree]
-    return float(value)
+def _bend(response: Response, band: int) -> tuple[float, ...]:
+    c = response.bends[band]
+    return (c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8], c[9])
 
 
 @compiled
-def _emit(film: npt.NDArray[np.float32], response: Response, emitted: Any) -> None:
-    """Signals (time, pixel) [K] of blackbodies in the first band less the reference, in place."""
+def emit(film: npt.NDArray[np.float32], response: Response) -> None:
+    """Signals [K] in the first band less the reference, of temperatures (time, pixel), in place."""
     for t in range(film.shape[0]):
         for p in range(film.shape[1]):
             place = (film[t, p] - response.middle) / response.half
-            emitted[t, p] = _polynomial_at(response.series, place)
+            film[t, p] = polynomial(response.series, place)
 
 
 @compiled
@@ -228,49 +228,48 @@ def _straighten(
     """Take the background's bend out of signals [K], in place; its mean slope (band, pixel) [1]."""
     bands, frames, pixels = signals.shape
     change = np.zeros((bands, pixels))
-    low, high = _polynomial_at(response.series, -1.0), _polynomial_at(response.series, 1.0)
-    for t in range(frames):
-        for p in range(pixels):
-            share = emissivity[0, p]
-            # What the first band holds beside the object; if unknown, nothing is taken out.
-            background = (signals[0, t, p] - share * emitted[t, p]) / (1.0 - share)
-            if np.isnan(background):
-                continue
-            background = min(max(background, low), high)
-            for band in range(1, bands):
-                bend = _polynomial_at(response.bends[band - 1], background)
-                after = _polynomial_at(response.bends[band - 1], background + _STEP)
-                signals[band, t, p] -= (1.0 - emissivity[band, p]) * bend
+    low, high = polynomial(response.series, -1.0), polynomial(response.series, 1.0)
+    for band in range(1, bands):
+        coefficients = _bend(response, band)
+        for t in range(frames):
+            for p in range(pixels):
+                share, factor = emissivity[0, p], 1.0 - emissivity[band, p]
+                # What the first band holds beside the object; if unknown, nothing is taken out.
+                background = (signals[0, t, p] - share * emitted[t, p]) / (1.0 - share)
+                factor = 0.0 if np.isnan(background) else factor
+                background = low if np.isnan(background) else min(max(background, low), high)
+                bend = polynomial(coefficients, background)
+                signals[band, t, p] -= factor * bend
                 # Change of the bend with the first band's signal.
-                rate = (after - bend) / (_STEP * frames * (1.0 - share))
-                change[band, p] += (1.0 - emissivity[band, p]) * rate
+                rate = (polynomial(coefficients, background + _STEP) - bend) / (_STEP * frames)
+                change[band, p] += factor * rate / (1.0 - share) if factor != 0.0 else 0.0
     return change
 
 
 @compiled
-def _without_object(
+def without_object(
     signals: Array, emitted: npt.NDArray[np.float32], emissivity: Array, response: Response
 ) -> None:
     """Take an object's signal (time, pixel) out of signals (band, time, pixel) [K], in place."""
     bands, frames, pixels = signals.shape
-    for t in range(frames):
-        for p in range(pixels):
-            signal = np.float64(emitted[t, p])
-            if np.isnan(signal * emissivity[0, p]):
-                continue
-            for band in range(bands):
-                bend = _polynomial_at(response.bends[band - 1], signal) if band > 0 else 0.0
-                signals[band, t, p] -= emissivity[band, p] * (signal + bend)
+    for band in range(bands):
+        coefficients = _bend(response, band)
+        for t in range(frames):
+            for p in range(pixels):
+                signal = np.float64(emitted[t, p])
+                object_part = emissivity[band, p] * (signal + polynomial(coefficients, signal))
+                signals[band, t, p] -= 0.0 if np.isnan(object_part) else object_part
 
 
-def _response(curves: tuple[Curve, ...]) -> Response:
+def responses_of(curves: tuple[Curve, ...]) -> Response:
     """Polynomials of the responses of the bands, the quietest first."""
     low, high = curves[0].lowest, curves[0].highest
     kelvin = np.linspace(low, high, 64)
     signal = curves[0].signal(kelvin) - curves[0].reference
-    series = np.asarray(Polynomial.fit(kelvin, signal, _DEGREE, [low, high]).coef, np.float64)
-    bends = system.bends(curves).astype(np.float64)
-    return Response(series, 0.5 * (low + high), 0.5 * (high - low), bends)
+    series = Polynomial.fit(kelvin, signal, _DEGREE, [low, high]).coef
+    series = np.pad(series, (0, 9 - _DEGREE))
+    bends = np.pad(system.bends(curves), ((1, 0), (0, 1)))
+    return Response(tuple(series.tolist()), 0.5 * (low + high), 0.5 * (high - low), bends)
 
 
 def _functions(inputs: Inputs) -> Array:
