@@ -314,7 +314,6 @@ def reflected(inputs: Inputs, result: xr.Dataset, rows: slice) -> Reading:
     film = film if finite.all() else smooth.bridge(film, pixels)
     reflections, shares = signals.copy(), np.where(pixels, emissivity, np.nan).astype(np.float64)
     responses = planes.responses_of(tuple(inputs.curves[band] for band in inputs.bands))
-    planes.emit(film, responses)
     planes.without_object(reflections, film, shares, responses)
     return Reading(rows, signals, reflections, frames, pixels, gain)
 

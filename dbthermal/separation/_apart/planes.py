@@ -173,19 +173,18 @@ def project(inputs: Inputs, result: xr.Dataset, emissivity: Floats, threads: Exe
                 slow = columns.functions[frames]
                 inverse = np.linalg.solve(slow.T @ slow, slow.T)
                 quick = rapid[frames] - slow @ (inverse @ rapid[frames])
-                emitted = select(film, places) if frames.all() else film[np.ix_(frames, places)]
-                emit(emitted, responses)
+                x = select(film, places) if frames.all() else film[np.ix_(frames, places)]
                 shares = emissivity[:, places].astype(np.float64)
                 inverse, quick = inverse.astype(np.float32), quick.astype(np.float32)
                 signals = np.ascontiguousarray(tile.signals, np.float32)
-                bend[:, places] = _straighten(signals, emitted, shares, responses)
+                bend[:, places] = _straighten(signals, x, shares, responses)
                 for band, signal in enumerate(signals):
                     straight[band][:, places] = inverse @ signal
                 if inputs.difference is not None:
                     more = inputs.difference(places)[:, frames]
                     for band, changes in enumerate(more, 1):
                         straight[band][:, places] += inverse @ changes
-                without_object(signals, emitted, shares, responses)
+                without_object(signals, x, shares, responses)
                 for band, signal in enumerate(signals):
                     maps[band][:, row, column] = quick.T @ signal
                 noise[0][:, row, column] = tile.scaled(tile.noise)
@@ -213,17 +212,14 @@ def _bend(response: Response, band: int) -> tuple[float, ...]:
 
 
 @compiled
-def emit(film: npt.NDArray[np.float32], response: Response) -> None:
-    """Signals [K] in the first band less the reference, of temperatures (time, pixel), in place."""
-    for t in range(film.shape[0]):
-        for p in range(film.shape[1]):
-            place = (film[t, p] - response.middle) / response.half
-            film[t, p] = polynomial(response.series, place)
+def _emitted(response: Response, temperature: float) -> float:
+    """Signal [K] of a blackbody in the first band less the reference."""
+    return float(polynomial(response.series, (temperature - response.middle) / response.half))
 
 
 @compiled
 def _straighten(
-    signals: Array, emitted: npt.NDArray[np.float32], emissivity: Array, response: Response
+    signals: Array, film: npt.NDArray[np.float32], emissivity: Array, response: Response
 ) -> Array:
     """Take the background's bend out of signals [K], in place; its mean slope (band, pixel) [1]."""
     bands, frames, pixels = signals.shape
@@ -235,7 +231,9 @@ def _straighten(
             for p in range(pixels):
                 share, factor = emissivity[0, p], 1.0 - emissivity[band, p]
                 # What the first band holds beside the object; if unknown, nothing is taken out.
-                background = (signals[0, t, p] - share * emitted[t, p]) / (1.0 - share)
+                background = (signals[0, t, p] - share * _emitted(response, film[t, p])) / (
+                    1.0 - share
+                )
                 factor = 0.0 if np.isnan(background) else factor
                 background = low if np.isnan(background) else min(max(background, low), high)
                 bend = polynomial(coefficients, background)
@@ -248,15 +246,15 @@ def _straighten(
 
 @compiled
 def without_object(
-    signals: Array, emitted: npt.NDArray[np.float32], emissivity: Array, response: Response
+    signals: Array, film: npt.NDArray[np.float32], emissivity: Array, response: Response
 ) -> None:
-    """Take an object's signal (time, pixel) out of signals (band, time, pixel) [K], in place."""
+    """Take an object's film (time, pixel) [K] out of signals (band, time, pixel) [K], in place."""
     bands, frames, pixels = signals.shape
     for band in range(bands):
         coefficients = _bend(response, band)
         for t in range(frames):
             for p in range(pixels):
-                signal = np.float64(emitted[t, p])
+                signal = _emitted(response, film[t, p])
                 object_part = emissivity[band, p] * (signal + polynomial(coefficients, signal))
                 signals[band, t, p] -= 0.0 if np.isnan(object_part) else object_part
 
