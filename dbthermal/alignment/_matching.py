@@ -140,7 +140,7 @@ def on_valid(places: Array, valid: Mask) -> Mask:
     return np.asarray(result & valid[row, column])
 
 
-def _information(movies: Movies, shift: Array, weights: Movie) -> tuple[Information, Movie]:
+def _information(movies: Movies, shift: Array, misfits: Movie) -> tuple[Information, Movie]:
     r"""Information on a step of the field at each pixel, by Gauss-Newton.
 
     With the moved movie m, its slopes g and a ratio k of a window, the residual of a pixel is
@@ -155,17 +155,18 @@ def _information(movies: Movies, shift: Array, weights: Movie) -> tuple[Informat
               b = k \left[\sum g r - q \sum g m \sum m r\right] - A \sigma^2 \nabla (k + u) / k
 
     over s^2, less what noise makes of the slopes, with the noise's variance s^2. Sums are over
-    time, of events (4 functions of a time each) with weights: second, those of the residual, which
-    is larger than noise where the object changes, too.
+    time, events (4 functions of a time each) of a misfit weighed less. Second, the misfit of the
+    residual (movie, y, x, event), over noise: it is larger where the object changes, too.
     """
     places, used = movies.pairs(shift)
     noise = movies.noise[0] * _VALUE_NOISE
     total = np.zeros((*used.shape, 6))
     window = partial(gaussian_filter, sigma=WINDOW)
     numbers = np.maximum(window(used * np.float32(1.0)), 1e-9)[..., np.newaxis] * movies.freedom
+    weights = misfits**-_EXCLUDED
     moments, events = images.products(movies.first, movies.targets, places, weights)
     moments *= used[..., np.newaxis]
-    updated = np.empty_like(weights)
+    updated = np.empty_like(misfits)
     for place, level in enumerate(movies.noise[1:]):
         mm, my, mx, mh, yy, yx, yh, xx, xh = np.moveaxis(moments[place, ..., :9], 2, 0)
         freedom = used * (weights[place] @ movies.freedom)
@@ -189,8 +190,7 @@ def _information(movies: Movies, shift: Array, weights: Movie) -> tuple[Informat
         squares, crosses, last = np.moveaxis(events[place], 3, 0)
         residual = used[..., np.newaxis] * (last - 2.0 * each * crosses + each**2 * squares)
         excess = images.blurred(residual, WINDOW) / scale - numbers
-        misfit = np.maximum(1.0 + excess / (numbers * movies.outside), 1.0)
-        updated[place] = misfit**-_EXCLUDED
+        updated[place] = np.maximum(1.0 + excess / (numbers * movies.outside), 1.0)
         yy, yx, xx = yy - share * my**2, yx - share * my * mx, xx - share * mx**2
         # By as much as the blur moves what it sees of an uneven ratio, the shift is not off.
         moved = free * BLUR**2 * np.stack(np.gradient(ratio + share * along))
@@ -258,12 +258,10 @@ def start(movies: Movies, planes: list[Movie], spline: Spline) -> Field | None:
 def refine(movies: Movies, field: Field) -> tuple[Field, Information]:
     """Field after Gauss-Newton, and the information of each pixel on it."""
     field = replace(field, settled=False)
-    weights = np.ones((len(movies.targets), *movies.valid.shape, movies.freedom.size), np.float32)
-    for number in range(-_WEIGHTED, _ROUNDS):
+    misfits = misfits_of(movies, field.on(movies.centres()))
+    for _ in range(_ROUNDS):
         shift = field.on(movies.centres())
-        data, weights = _information(movies, shift, weights)
-        if number < 0:
-            continue
+        data, misfits = _information(movies, shift, misfits)
         field = field.spline.fitted(data, movies.centres(), field)
         change = np.abs(field.on(movies.centres()) - shift)
         if change.mean() < _CONVERGED * movies.factor**2:
@@ -271,10 +269,19 @@ def refine(movies: Movies, field: Field) -> tuple[Field, Information]:
     return field, data
 
 
-def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Array]:
+def misfits_of(movies: Movies, shift: Array) -> Movie:
+    """Misfit (movie, y, x, event) over noise of what a shift (2, y, x) [pixel] explains."""
+    result = np.ones((len(movies.targets), *movies.valid.shape, movies.freedom.size), np.float32)
+    for _ in range(_WEIGHTED):
+        _, result = _information(movies, shift, result)
+    return result
+
+
+def delay(movies: Movies, rate: Movie, shift: Array, misfits: Movie) -> tuple[float, float, Array]:
     r"""Time by which the others show what the first movie shows at a shift, and its deviation [s].
 
-    The shift is (2, y, x) [pixel], the rate a matrix that takes planes to their change [1/s].
+    The shift is (2, y, x) [pixel], the rate a matrix that takes planes to their change [1/s];
+    misfits of events, see `misfits_of`, are taken for their variances.
     Motion in one direction looks like a shift or a delay: a Newton step solves for both, the shift
     free in each window. With the slopes g of the moved movie :math:`h`, its change :math:`\dot h`,
     the residual r of the others over their ratio to h, and sums over time and a window,
@@ -286,15 +293,15 @@ def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Arra
     beside noise, in variances of noise.
     """
     places, used = movies.pairs(shift)
-    even = np.ones((len(movies.targets), *used.shape, 1), np.float32)
-    moments, _ = images.products(movies.first, movies.targets, places, even, rate)
-    freedom = movies.freedom.sum()
-    # Noise of the slopes and of the moved movie.
-    number = gaussian_filter(used * freedom, WINDOW)[..., np.newaxis] * movies.noise[0] ** 2
-    less = number * np.square([_VALUE_NOISE, _SLOPE_NOISE, _SLOPE_NOISE, 0.0])
+    weights = 1.0 / misfits
+    moments, _ = images.products(movies.first, movies.targets, places, weights, rate)
     totals = np.zeros((4, *movies.valid.shape))
-    for array, level in zip(moments, movies.noise[1:], strict=True):
+    for array, each, level in zip(moments, weights, movies.noise[1:], strict=True):
         windows = images.blurred(array * used[..., np.newaxis], WINDOW)
+        freedom = gaussian_filter(used * (each @ movies.freedom), WINDOW)
+        # Noise of the slopes and of the moved movie.
+        less = freedom[..., np.newaxis] * movies.noise[0] ** 2
+        less = less * np.square([_VALUE_NOISE, _SLOPE_NOISE, _SLOPE_NOISE, 0.0])
         equations = images.normal_equations(windows, less)
         # The shift of each window is eliminated.
         tensor, cross = equations[..., :2, :2], equations[..., :2, 2]

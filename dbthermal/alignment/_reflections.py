@@ -104,9 +104,10 @@ def shift_of(corrected: xr.Dataset, scale: Scale) -> xr.Dataset:
     rate = np.linalg.lstsq(functions[-1], change)[0].astype(np.float32)
     slower = fine if len(movies) == 1 else level(-1, 1)
     place = field.on(fine.centres())
-    late, std, energy = matching.delay(slower, rate, place)
+    misfits = matching.misfits_of(slower, place)
+    late, std, energy = matching.delay(slower, rate, place, misfits)
     # A shift that explains little of what no shift leaves is not that of the reflections.
-    still = matching.delay(slower, rate, np.zeros_like(place))[2]
+    still = matching.delay(slower, rate, np.zeros_like(place), misfits)[2]
     sums = np.sum([energy, still], axis=(2, 3), where=energy[1] * still[1] != 0.0)
     moved, unmoved = 1.0 - quotient(sums[:, 0], sums[:, 1], 1.0)
     if not unmoved - max(moved, 0.0) > max(_EXPLAINED * unmoved, _LEAST_GAIN):

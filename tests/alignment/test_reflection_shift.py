@@ -211,9 +211,12 @@ def test_touches_are_no_reflections(seed: int) -> None:
     scene["background_temperature"] = dims, films[1:], {"units": "K"}
     field = alignment.reflection_shift(simulation.observe(scene, QUIET, rng), QUIET)
     error, score = errors(field, true)
+    late = 10.0 * field.attrs["delay"]  # [frame]
     print(f"{np.median(np.abs(error[1])):.4f} pixel off, {np.sqrt(np.mean(score[1] ** 2)):.1f}")
+    print(f"{late:.4f} frames late")
     assert np.median(np.abs(error[1])) < 0.04
     assert np.quantile(np.abs(error[1]), 0.95) < 0.2
+    assert abs(late) < 0.012
 
 
 @pytest.mark.parametrize(
