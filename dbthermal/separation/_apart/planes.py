@@ -207,6 +207,7 @@ class Response(NamedTuple):
 
 @compiled
 def _bend(response: Response, band: int) -> tuple[float, ...]:
+    """Coefficients of a band's bend, of a length that is compiled into its loops."""
     c = response.bends[band]
     return (c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8], c[9])
 

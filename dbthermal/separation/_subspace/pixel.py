@@ -347,15 +347,15 @@ def emission(model: Model, record: Any, work: Work, rounds: int) -> Line:
     fixed, constant = record.pooled and not np.isnan(material[1] + material[2]), False
     emissivity = guess if 0 < guess < 1 and not fixed else middle
     slope, variance, scale, energy = 0.0, 0.0, 0.0, 0.0
-    before, slope_before, again = np.nan, np.nan, rounds > 0
+    before, slope_before, is_started = np.nan, np.nan, rounds > 0
     for turn in range(ROUNDS):
         _approach(model, emissivity, work, work.emitted)
         if fixed and turn < ROUNDS - 1:  # the line is for its residual alone
             continue
         slope, variance, scale, energy = regression.regress(
-            work.emitted, z, work.noise[0], weights, work.residual, work.few, again
+            work.emitted, z, work.noise[0], weights, work.residual, work.few, is_started
         )
-        again = True
+        is_started = True
         constant = energy < OBJECT_TO_NOISE * count * record.null_variance and not fixed
         rate = (slope - slope_before) / (emissivity - before)
         before, slope_before = emissivity, slope

@@ -151,7 +151,7 @@ def _started(x: Array, y: Array, noise: float, few: Any) -> tuple[float, float]:
 
 @compiled
 def regress(
-    x: Array, y: Array, noise: float, weights: Array, residual: Array, few: Any, again: int
+    x: Array, y: Array, noise: float, weights: Array, residual: Array, few: Any, is_started: int
 ) -> tuple[float, float, float, float]:
     """Robust line of Tukey's bisquare weights: slope, its variance, scale, energy of abscissa.
 
@@ -161,7 +161,7 @@ def regress(
     the `noise` of the ordinate. Residual and weights are in place.
     """
     # From weights of nearly the same points, or anew.
-    if again:
+    if is_started:
         slope, intercept, energy = moments(x, y, weights)
     else:
         slope, intercept = _started(x, y, noise, few)
