@@ -12,7 +12,7 @@ HOUSE = Path(dbthermal.__file__).parent
 BUDGET = {
     "": (3471, 15),
     "_cli": (1249, 5),
-    "alignment": (2869, 10),
+    "alignment": (2880, 10),
     "calibration": (740, 2),
     "correction": (1704, 5),
     "emissivity": (409, 1),
@@ -22,7 +22,7 @@ BUDGET = {
     "limits": (661, 2),
     "readers": (2763, 10),
     "reporting": (362, 1),
-    "separation": (12752, 48),
+    "separation": (12741, 48),
     "simulation": (511, 1),
     "store": (1366, 6),
 }

@@ -11,7 +11,6 @@ they are, and a map of each product is blurred at once, not a film.
 
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -152,9 +151,7 @@ class Planes:
 def project(inputs: Inputs, result: xr.Dataset, emissivity: Floats, threads: Executor) -> Planes:
     """Planes of a capture, by the object in a result of it and emissivities (band, pixel) [1]."""
     bands, (height, width) = inputs.bands, result["status"].shape
-    assert inputs.displacement is not None
-    rapid = inputs.displacement.once("rapid", partial(_functions, inputs))
-    columns = system.smooth_functions(inputs.capture)
+    rapid, columns = _functions(inputs), system.smooth_functions(inputs.capture)
     maps = np.zeros((len(bands), rapid.shape[1], height, width), np.float32)
     straight = np.zeros((len(bands), columns.functions.shape[1], height * width), np.float32)
     noise, freedom = np.ones((2, len(bands), height, width)), np.ones((height, width))
@@ -232,9 +229,8 @@ def _straighten(
             for p in range(pixels):
                 share, factor = emissivity[0, p], 1.0 - emissivity[band, p]
                 # What the first band holds beside the object; if unknown, nothing is taken out.
-                background = (signals[0, t, p] - share * _emitted(response, film[t, p])) / (
-                    1.0 - share
-                )
+                emitted = share * _emitted(response, film[t, p])
+                background = (signals[0, t, p] - emitted) / (1.0 - share)
                 factor = 0.0 if np.isnan(background) else factor
                 background = low if np.isnan(background) else min(max(background, low), high)
                 bend = polynomial(coefficients, background)
@@ -265,8 +261,7 @@ def responses_of(curves: tuple[Curve, ...]) -> Response:
     low, high = curves[0].lowest, curves[0].highest
     kelvin = np.linspace(low, high, 64)
     signal = curves[0].signal(kelvin) - curves[0].reference
-    series = Polynomial.fit(kelvin, signal, _DEGREE, [low, high]).coef
-    series = np.pad(series, (0, 9 - _DEGREE))
+    series = np.pad(Polynomial.fit(kelvin, signal, _DEGREE, [low, high]).coef, (0, 9 - _DEGREE))
     bends = np.pad(system.bends(curves), ((1, 0), (0, 1)))
     return Response(tuple(series.tolist()), 0.5 * (low + high), 0.5 * (high - low), bends)
 
