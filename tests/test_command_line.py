@@ -426,7 +426,7 @@ def test_curves_films_pictures(results: Path) -> None:
     with (results / "places.csv").open(encoding="utf-8", newline="") as stream:
         last = [*csv.DictReader(stream)][-1]
     assert "dead_pixel" in last[f"pixel {worst[0]} {worst[1]} status"]
-    whole = "rows 0 to 24 columns 0 to 32 measured"
+    whole = "rows 0 to 23 columns 0 to 31 measured"
     assert last[f"{whole} status"] == "no_flag"
     assert float(last[f"{whole} pixels [1]"]) == (status == 0).sum()
     for suffix in ("tif", "png", "nc", "gif"):
@@ -476,7 +476,7 @@ def test_report_and_explorer(results: Path) -> None:
     short = store.open_dataset(results / "result.zarr").isel(time=slice(0, 20))
     store.save(short, results / "short.zarr", {})
     done(results, "report", "short.zarr", "--region", "2", "8", "2", "8", "-o", "out.html")
-    assert "rows 2 to 8, columns 2 to 8" in (results / "out.html").read_text(encoding="utf-8")
+    assert "rows 2 to 7, columns 2 to 7" in (results / "out.html").read_text(encoding="utf-8")
     done(results, "explore", *shown, "-o", "look.ipynb")
     for name in ("scene", "aligned"):
         done(results, "explore", f"{name}.zarr", "-o", f"{name}.ipynb")
@@ -614,7 +614,7 @@ align scene.zarr -o x.zarr -> Invalid capture .* of stage 'capture'. Must be of 
 correct scene.zarr response.zarr -o x.zarr -> of stage 'response'. Must be of stage 'corr
 separate aligned.zarr response.zarr --offset 0 -o x.zarr -> Unused option --offset.
 info result.zarr/status -> an array. Must be the store that it is in: 'result.zarr'.
-report result.zarr -o x.html --region 0 900 0 4 -> Invalid rows 0 to 900, columns 0 to
+report result.zarr -o x.html --region 0 900 0 4 -> Invalid region 0 900 0 4. Must lie in
 report {STORES} nuc.zarr -o x.html -> Invalid 3 stores beside 'result.zarr'. Must be its capture
 explore response.zarr -o x.ipynb -> Invalid result 'response.zarr' of stage 'response'.
 explore result.zarr nuc.zarr -o x.ipynb -> Invalid capture 'nuc.zarr' of stage 'correction'

@@ -82,10 +82,10 @@ def _regions(result: xr.Dataset, boxes: Iterable[Sequence[int]]) -> dict[str, ex
     """Rectangles y0 y1 x0 x1 by their names; they must lie in the image."""
     regions, height, width = {}, result.sizes["y"], result.sizes["x"]
     for top, bottom, left, right in boxes:
-        label = f"rows {top} to {bottom}, columns {left} to {right}"
+        label = f"rows {top} to {bottom - 1}, columns {left} to {right - 1}"
         if not (0 <= top < bottom <= height and 0 <= left < right <= width):
             rule = f"Must lie in the image of {height} x {width}, and end after it begins"
-            raise ValueError(f"Invalid {label}. {rule}.")
+            raise ValueError(f"Invalid region {top} {bottom} {left} {right}. {rule}.")
         regions[label] = explorer.Region("rectangle", ((top, left), (bottom, right)))
     return regions
 
