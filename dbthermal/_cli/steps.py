@@ -228,6 +228,7 @@ def _aligning(options: Namespace, capture: xr.Dataset) -> dict[str, Any]:
 
 def separate(options: Namespace) -> dict[str, Any]:
     """Command `separate`."""
+    # Inputs of the stages that the way needs.
     is_raw = bool(options.correction or options.corrected_by_camera)
     stages = {"capture": "capture|corrected" if is_raw else "corrected", "response": "response"}
     stages |= {"correction": "correction"} if options.correction else {}

@@ -133,14 +133,11 @@ class Capture:
         return np.stack([np.pad(penalty.diagonal(lag), (lag, 0)) for lag in (3, 2, 1, 0)])
 
     def functions(self, signals: Movie, period: float) -> Movie:
-        """Functions (time, plane), each of a moment, of most changes within a period [frame]."""
+        """Functions (time, plane) of the changes within a period [frame] that signals show most."""
         smoothing = self.smoothing(period)
         sample = signals.reshape(-1, signals.shape[-1])
         sample = sample[:: max(1, len(sample) // (_FOR_EACH * _PLANES))]
-        leading = smooth.leading(rapid(sample, smoothing), _PLANES)
-        # Eigenvectors of time within their span are the most local functions, in order.
-        _, turn = np.linalg.eigh(leading.T @ (np.arange(len(leading))[:, np.newaxis] * leading))
-        functions = rapid((leading @ turn).T, smoothing).T
+        functions = rapid(smooth.leading(rapid(sample, smoothing), _PLANES).T, smoothing).T
         return np.ascontiguousarray(functions, np.float32)
 
     def planes(self, functions: list[Movie]) -> list[list[Movie]]:
@@ -304,8 +301,7 @@ def _window_equations(corrected: xr.Dataset, scale: Scale) -> Iterator[tuple[Arr
         for block, function, rate in zip(sums, functions, rates, strict=True):
             planes = np.tensordot(film, function.astype(np.float32), (1, 0))
             first, second = images.splines(planes[0], _BLUR), images.blurred(planes[1], _BLUR)
-            even, steps = np.ones((1, *places.shape[1:], 1), np.float32), rate.astype(np.float32)
-            pairs = images.products(first, [second], places, even, steps)[0][0].sum(axis=0)
+            pairs = images.products(first, [second], places, rate.astype(np.float32))[0].sum(axis=0)
             within = (slice(start, start + side) for start in lefts - columns.start)
             block.extend(pairs[window].sum(axis=0) for window in within)
     # Noise of variance s^2, blurred by b: s^2 / (4 pi b^2), of a slope 1 / (2 b^2) of that.

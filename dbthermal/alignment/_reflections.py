@@ -17,11 +17,16 @@ from dbthermal.alignment._planes import Capture, Scale
 from dbthermal.alignment._splines import Field, Information, Movie, Spline, binned
 
 _COARSE: Final = 28  # pixels along the shorter side of the coarsest image, at least
-# Periods [frame] of which slower changes are left out. A longer one is taken whose field has so
-# many times smaller deviations where the shorter one is known.
+_FEW: Final = 64  # functions of time on the coarsest image
+_START: Final = 20  # pixels along the shorter side for whole-pixel matches, at least
+# Periods [frame] of which slower changes are left out: the shorter, the less an object that heats
+# rapidly enters. A longer one is taken whose field has so many times smaller deviations where the
+# shorter one is known, and a chi-square by the shorter one's data below so much: of people before
+# glass, a wineglass and a coffee pot it was .1 to 3.0, and 6 to 3000 where an object's own changes
+# entered.
 _PERIODS: Final = (5.0, 10.0, 20.0, 80.0)
 _SLOW: Final = 20.0  # shortest period of which a delay is estimated [frame]
-_MORE: Final = 1.25
+_MORE, _AGREE = 1.25, 4.5
 _KNOWN: Final = 0.2  # largest deviation of a shift by the data of a window alone [pixel]
 _WIDE: Final = 6.0  # deviation of the window in which a field and its data are compared [pixel]
 _RIDGE: Final = 1e-6  # of the largest information, added for windows without any
@@ -88,8 +93,8 @@ def shift_of(corrected: xr.Dataset, scale: Scale) -> xr.Dataset:
     def level(place: int, factor: int) -> Movies:
         """Movies of the changes within one of the periods, of coarser pixels."""
         pictures = [binned(movie, factor) for movie in movies[place]]
-        squares = np.sum(functions[place] ** 2, axis=0)  # of white noise
-        return Movies.blurred(pictures, capture.valid, capture.noise, squares, factor, white)
+        freedom = float(np.sum(functions[place] ** 2))  # of white noise
+        return Movies.blurred(pictures, capture.valid, capture.noise, freedom, factor, white)
 
     # From coarser pixels to those of the capture.
     while factor > 2:
@@ -104,10 +109,9 @@ def shift_of(corrected: xr.Dataset, scale: Scale) -> xr.Dataset:
     rate = np.linalg.lstsq(functions[-1], change)[0].astype(np.float32)
     slower = fine if len(movies) == 1 else level(-1, 1)
     place = field.on(fine.centres())
-    misfits = matching.misfits_of(slower, place)
-    late, std, energy = matching.delay(slower, rate, place, misfits)
+    late, std, energy = matching.delay(slower, rate, place)
     # A shift that explains little of what no shift leaves is not that of the reflections.
-    still = matching.delay(slower, rate, np.zeros_like(place), misfits)[2]
+    still = matching.delay(slower, rate, np.zeros_like(place))[2]
     sums = np.sum([energy, still], axis=(2, 3), where=energy[1] * still[1] != 0.0)
     moved, unmoved = 1.0 - quotient(sums[:, 0], sums[:, 1], 1.0)
     if not unmoved - max(moved, 0.0) > max(_EXPLAINED * unmoved, _LEAST_GAIN):
@@ -130,19 +134,26 @@ def _coarse(
     signals, valid = capture.binned(factor)
     frames, tried, result = capture.frames.size, dict[float, Movie](), None
     refusal: ValueError | None = None
-    # Of the field that was taken: the pixels that its data resolve, and its deviations.
-    earlier, sizes = np.zeros((1, 1), bool), np.zeros((1, 1))
+    # Of the field that was taken: its data, the pixels that they resolve, and its deviations.
+    before, earlier, sizes = None, np.zeros((1, 1), bool), np.zeros((1, 1))
     for period in _PERIODS:
         if frames < 2 * period and result is not None:
             break
-        tried[period] = functions = capture.functions(signals[0], period)
-        white, squares = planes.white(frames, period), np.sum(functions**2, axis=0)
+        tried[period] = capture.functions(signals[0], period)
+        functions = tried[period][:, :_FEW]
+        white, freedom = planes.white(frames, period), float(np.sum(functions**2))
         pictures = [signal @ functions for signal in signals]
-        level = Movies.blurred(pictures, valid, capture.noise, squares, factor, white)
+        level = Movies.blurred(pictures, valid, capture.noise, freedom, factor, white)
         begin = None if result is None else result[-1]
         if begin is None:
+            # Whole frames, of which what is rare in a pixel's time is cut.
+            half = 2 if min(level.valid.shape) >= 2 * _START else 1
+            mostly = binned(level.valid * 1.0, half) > 0.5
+            rough = replace(level, valid=mostly, noise=level.noise / half, factor=factor * half)
+            smoothing = capture.smoothing(period)
+            films = [planes.rapid(binned(signal, half), smoothing) for signal in signals]
             try:
-                begin = matching.start(level, pictures, spline)
+                begin = matching.start(rough, films, white, spline)
             except ValueError as error:  # slower changes may tell more
                 refusal = error
         if begin is None:
@@ -150,9 +161,15 @@ def _coarse(
         field, data = matching.refine(level, begin)
         resolved = _resolved(data, factor)
         size = 0.25 * np.log(_variances(field, level, data)).sum(axis=0)
-        gain = np.inf if result is None else np.mean((sizes - size)[earlier])
-        if resolved.any() and gain > np.log(_MORE):
-            earlier, sizes = resolved, size
+        gain, distance = np.inf, 0.0
+        if before is not None:
+            gain = np.mean((sizes - size)[earlier])
+            # A field of slower changes must fit the data of the more robust field before it, unless
+            # that field's deviation is a pixel or more: an unknown field vetoes no shift.
+            distance = begin.disagreement(before, level.centres(), field)
+            distance = distance if np.mean(sizes[earlier]) < 0.0 else 0.0
+        if resolved.any() and gain > np.log(_MORE) and distance < _AGREE:
+            before, earlier, sizes = data, resolved, size
             result = (replace(capture, valid=valid), tried, period, field)
     if result is None:
         raise refusal or ValueError(

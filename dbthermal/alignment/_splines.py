@@ -64,32 +64,25 @@ def splines(movie: Movie, width: float) -> Movie:
     return np.pad(smooth, ((_EDGE, _EDGE), (_EDGE, _EDGE), (0, 0)), mode="symmetric")
 
 
-def products(
-    movie: Movie, movies: list[Movie], places: Array, weights: Movie, rate: Movie | None = None
-) -> tuple[Array, Movie]:
+def products(movie: Movie, movies: list[Movie], places: Array, rate: Movie | None = None) -> Array:
     """Sums over planes (movie, y, x, pair) of the products of signals at places (2, y, x).
 
     Signals are the moved movie, of `splines`, its slopes down and right, and another movie, each
     with itself and all that follow: 10 pairs. With a matrix (plane, plane) of the rate of change
-    the rate follows the slopes: 15 pairs. Weights (movie, y, x, event) are of as many planes each.
-    Second, of each event the pairs (movie, y, x, event, 3) of the two movies.
+    the rate follows the slopes: 15 pairs.
     """
     shape, planes = places.shape[1:], movie.shape[2]
     count = 4 if rate is None else 5
-    result = np.empty((len(movies), *shape, count * (count + 1) // 2))
-    events = np.empty((*weights.shape, 3), np.float32)
+    result = np.zeros((len(movies), *shape, count * (count + 1) // 2))
     for start in range(0, shape[0], _ROWS):
         rows = slice(start, min(start + _ROWS, shape[0]))
         signals = sampled(movie, places[:, rows].reshape(2, -1) + _EDGE)
         if rate is not None:
             signals = np.concatenate([signals, (signals[0] @ rate)[np.newaxis]])
-        sums = np.empty((signals.shape[1], weights.shape[3], result.shape[3]), np.float32)
-        for place, second in enumerate(movies):
+        for second, out in zip(movies, result, strict=True):
+            sums = out[rows].reshape(-1, out.shape[2])
             _sum_pairs(signals, second[rows].reshape(-1, planes), sums)
-            of_events = sums.reshape(-1, *weights.shape[2:], result.shape[3])
-            result[place, rows] = np.einsum("yxe,yxep->yxp", weights[place, rows], of_events)
-            events[place, rows] = of_events[..., [0, count - 1, -1]]
-    return result, events
+    return result
 
 
 def normal_equations(sums: Array, noise: Array) -> Array:
@@ -171,19 +164,18 @@ def _cubic(away: float) -> float:
 
 
 @compiled
-def _sum_pairs(signals: Movie, last: Movie, out: Movie) -> None:
-    """Sums over an event's planes (pixel, event, pair) of the products of signals, in place."""
+def _sum_pairs(signals: Movie, last: Movie, out: Array) -> None:
+    """Sums over planes (pixel, pair) of the products of signals, in place."""
     count, pixels, planes = signals.shape
-    length = -(-planes // out.shape[1])
-    for p, event in np.ndindex(pixels, out.shape[1]):
+    for p in range(pixels):
         place = 0
         for i in range(count + 1):
             first = signals[i, p] if i < count else last[p]
             for j in range(i, count + 1):
                 second, total = signals[j, p] if j < count else last[p], np.float32(0.0)
-                for t in range(event * length, min((event + 1) * length, planes)):
+                for t in range(planes):
                     total += first[t] * second[t]
-                out[p, event, place] = total
+                out[p, place] = total
                 place += 1
 
 
@@ -308,12 +300,22 @@ class Field:
         nodes = self.nodes.reshape(2, *self.spline.nodes)
         return np.stack([rows @ plane @ columns.T for plane in nodes])
 
+    @cached_property
+    def covariance(self) -> Array:
+        """Covariance (node, node) [pixel^2]."""
+        return self.spline.solved(self.factor, np.eye(self.nodes.size))
+
+    def disagreement(self, data: Information, centres: list[Array], field: "Field") -> float:
+        """Chi-square of another field by the data of this one, over what chance makes of it."""
+        matrix = _normal(data.tensor, *self.spline.values(centres))
+        off = field.nodes - self.nodes
+        return float(off @ matrix @ off / np.sum(self.covariance * matrix))
+
     def variances(self, centres: list[Array]) -> Array:
         """Variance (2, y, x) of the displacement at each place [pixel^2]."""
         rows, columns = (_pairs(pair) for pair in self.spline.values(centres))
         height, width = self.spline.nodes
-        covariance = self.spline.solved(self.factor, np.eye(self.nodes.size))
-        blocks = covariance.reshape(2, height, width, 2, height, width)
+        blocks = self.covariance.reshape(2, height, width, 2, height, width)
         planes = [blocks[axis, :, :, axis].transpose(0, 2, 1, 3) for axis in (0, 1)]
         return np.stack([rows @ it.reshape(height**2, width**2) @ columns.T for it in planes])
 

@@ -52,8 +52,10 @@ def answer(result: xr.Dataset, materials: xr.Dataset | None = None) -> tuple[lis
     if result.attrs.get("surroundings_source") == "capture":
         level = f"Reflected surroundings at {result.attrs['surroundings'] - zero_Celsius:.1f} degC"
         sentences.append(f"{level}; a calibration is wrong if that is far off.")
+    # Shares of the pixels.
     remainder = f"completed, not measured: {completed.mean():.0%}"
     sentences.append(f"Measured: {measured.mean():.0%} of the pixels; {remainder}.")
+    # Materials, and what to watch out for.
     numbers["materials"] = listed = by_material(result, measured, table)
     for entry in listed:
         columns = (entry[key].values() for key in _EMISSIVITIES)

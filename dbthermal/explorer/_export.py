@@ -48,6 +48,7 @@ def figure(view: View, shown: Shown) -> Figure:
     height = 3.6 * view.shape[0] / view.shape[1] + 0.5
     result, axes = drawing.canvas(rows, columns, (4.4 * columns, height * rows + 0.4))
     places: list[Axes] = axes.ravel().tolist()
+    # Pictures, then nothing in the places without one.
     for axis in places[len(names) :]:
         axis.set_axis_off()
     for axis, name in zip(places, names, strict=False):
@@ -66,6 +67,7 @@ def figure(view: View, shown: Shown) -> Figure:
             scale = (low - offset, high - offset)
             title = pane.label[0].upper() + pane.label[1:]
             drawing.draw_image(result, axis, image, title, label, cmap=shown.palette, limits=scale)
+        # Outlines of the regions, in the colours of their curves.
         for place, region in enumerate(shown.regions.values()):
             color = drawing.COLORS[place % len(drawing.COLORS)]
             patch = axis.add_patch(_outline(region, fill=False, edgecolor=color, linewidth=1.5))

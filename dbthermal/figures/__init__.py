@@ -321,6 +321,7 @@ def plan(expected: xr.Dataset, durations: xr.Dataset, materials: Sequence[str]) 
     bar = figure.colorbar(drawn, ax=map_axis, label="expected std [K]", shrink=0.8, extend="both")
     drawing.plain_decades(bar.ax)
     map_axis.set_xlabel(f"filter beside {expected.attrs['beside']} [{_MICRO}]")
+    # Lines of the materials over the length.
     best = expected["best"].sel(material=list(materials))
     filtered = best[np.isin(best.values, std["filter"].values)]
     for index, name in enumerate(filtered["material"].values):
@@ -397,6 +398,7 @@ def status(result: xr.Dataset) -> Figure:
     map_axis.imshow(image, interpolation="nearest")
     map_axis.set(xticks=[], yticks=[])
     legend_axis.set_axis_off()
+    # Legend with shares.
     patches = [
         Patch(facecolor=color, edgecolor="0.5", label=f"{drawing.percent(share)}  {words}")
         for words, color, share in shown

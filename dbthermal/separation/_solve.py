@@ -19,7 +19,7 @@ from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._apart import side_by_side
 from dbthermal.separation._inputs import Inputs, Method, check
 from dbthermal.separation._pooling import pool as pooling
-from dbthermal.separation._tiles import Estimate, Mask, Material, Survey
+from dbthermal.separation._tiles import Array, Estimate, Mask, Material, Survey, Whole
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance  # settings of a method from outside
@@ -368,7 +368,7 @@ def _write(
         # What has no estimate becomes NaN.
         if name == "status":
             target[...] = cut.status.reshape(shape)
-        else:
+        elif not whole:
             target[...] = np.nan
         for frames, pixels, estimate in estimates:
             values, places = getattr(estimate, name), pixels.reshape(shape)
@@ -381,8 +381,15 @@ def _write(
             elif whole:
                 target[...] = values.reshape(target.shape)
             else:
-                # Frame by frame: at once it takes four times as long.
-                for frame, samples in zip(np.flatnonzero(frames), values, strict=True):
-                    target[frame][places] = samples
+                _place(target, np.flatnonzero(frames), places, values)
         if "time" in dims and invalid.any():
             target[invalid] = np.nan
+
+
+def _place(film: Array, frames: Whole, places: Mask, values: Array) -> None:
+    """Write values (frame, pixel) at some frames and places (y, x) of a film, in place."""
+    if frames.size > values.shape[1]:
+        film[frames[:, np.newaxis], *np.nonzero(places)] = values
+        return
+    for frame, samples in zip(frames, values, strict=True):  # at once it takes four times as long
+        film[frame][places] = samples

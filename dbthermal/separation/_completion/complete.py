@@ -316,6 +316,7 @@ def _bridge_rows(completed: xr.Dataset, frames: Mask, lacking: Mask, rows: slice
     bridged, status = lacking[:, rows], completed["status"].values[rows]
     bridged &= np.isfinite(completed[FILMS[0]].values[:, rows])
     bridged &= (status & np.uint32(schema.COMPLETED & ~Status.COMPLETED_FRAMES)) == 0
+    # A pixel that lacked too many frames gets a bit of the status, too.
     mostly = bridged.mean(axis=0) >= quality.MOST_BRIDGED
     status |= mostly * np.uint32(Status.COMPLETED_FRAMES)
     if "bridged" in completed:
