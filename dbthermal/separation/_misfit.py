@@ -162,6 +162,14 @@ def _leak(blocks: _Blocks) -> Array:
     return np.asarray(np.sqrt(np.where(scatter > _SURE * doubt, scatter, 0.0)))
 
 
+def _block_sums(film: Array, width: int) -> Array:
+    """Sums (time, block) over the blocks of a film (time, pixel) of an image's width."""
+    image = film.reshape(len(film), -1, width)
+    for axis in (1, 2):
+        image = np.add.reduceat(image, range(0, image.shape[axis], _BLOCK), axis=axis)
+    return np.asarray(image.reshape(len(film), -1))
+
+
 def _of_rows(
     inputs: Inputs, result: xr.Dataset, reading: Reading
 ) -> tuple[_Blocks, tuple[Array, Array]]:
@@ -174,17 +182,9 @@ def _of_rows(
     shape = -(-pixels.size // width // _BLOCK), -(-width // _BLOCK)
     row, column = np.divmod(np.arange(pixels.size), width)
     place = np.where(pixels, row // _BLOCK * shape[1] + column // _BLOCK, -1)
-
-    def summed(film: Array) -> Array:
-        image = film.reshape(len(film), -1, width)
-        for axis in (1, 2):
-            image = np.add.reduceat(image, range(0, image.shape[axis], _BLOCK), axis=axis)
-        return np.asarray(image.reshape(len(film), -1))
-
-    number = summed(1.0 * pixels[np.newaxis])[0]
+    number = _block_sums(1.0 * pixels[np.newaxis], width)[0]
     # Weigh the bands, and average what is left beside the object, and the reflection.
-    deviation = inputs.noise[inputs.bands, np.newaxis] * gain
-    terms = _weights(np.where(pixels, ratio, 0.5), deviation)
+    terms = _weights(np.where(pixels, ratio, 0.5), inputs.noise[inputs.bands, None] * gain)
     weights, noise = (np.where(pixels, term, 0.0) for term in terms)
     # A span of time is an octave beyond the smooth functions, half of an event.
     length = _length(frames.size)
@@ -192,23 +192,23 @@ def _of_rows(
     span = np.unique(2 * event + (2 * half >= length), return_inverse=True)[1]
     sums = np.zeros((2, signals.shape[1], number.size))
     for chunk in stretches(signals[0]):
-        sums[0, chunk] = summed(np.einsum("btp,bp->tp", reflections[:, chunk], weights))
-        sums[1, chunk] = summed(signals[0, chunk] * pixels)
+        sums[0, chunk] = _block_sums(np.einsum("btp,bp->tp", reflections[:, chunk], weights), width)
+        sums[1, chunk] = _block_sums(signals[0, chunk] * pixels, width)
     single = _single_pixels(inputs, signals, weights, frames, place, number.size)
     release()
     filled = np.maximum(number, 1.0)
     # Take the smooth functions out, and sum over means and events.
     basis = smooth_functions(inputs, frames)
-    noise, sums = summed(noise) / filled**2, sums / filled
+    noise, sums = _block_sums(noise, width) / filled**2, sums / filled
     remainder, reflection = sums - basis @ (basis.T @ sums)
-    levels = _levels(summed(weights) / filled, noise[0], remainder, frames, shape)
+    levels = _levels(_block_sums(weights, width) / filled, noise[0], remainder, frames, shape)
     # Deviations of objects in pieces of time hold a part already.
     stated, start = np.zeros(pixels.size), rows.start * width
     divided = pixels & inputs.division[:, start : start + pixels.size].any(axis=0)
     if divided.any():
         film = result["object_temperature_std"].values[:, rows].reshape(-1, pixels.size)
         stated[divided] = np.nanmean(np.square(film[:, divided]), axis=0)
-    stated = summed(stated[np.newaxis])[0] / filled
+    stated = _block_sums(stated[np.newaxis], width)[0] / filled
     if inputs.displacement is not None or np.any(schema.noise_factor(inputs.capture) < 1.0):
         jumps = np.diff(remainder, 2, axis=0)  # neighbours share noise
         noise[0] = np.maximum(noise[0], np.mean(jumps**2, axis=0) / 6.0)
