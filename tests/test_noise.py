@@ -1,12 +1,13 @@
 """Noise estimated from simulated signals, one disturbance at a time."""
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 
 from dbthermal import noise
+from dbthermal.simulation import Background
 
 FRAMES, PIXELS = 350, 200
 TIME = np.arange(FRAMES) / 10.0
@@ -27,22 +28,9 @@ def white(rng: np.random.Generator) -> Signals:
     return first, second
 
 
-def pulses(rng: np.random.Generator, share: float) -> Signals:
-    """A background that is 3 K warmer for a second, now and then."""
-    starts = rng.random((FRAMES, PIXELS)) < share / 10.0
-    return reflected(3.0 * (lfilter(np.ones(10), 1.0, starts, axis=0) > 0.5))
-
-
-def walk(rng: np.random.Generator, correlation_time: float) -> Signals:
-    """A background of 3 K, a random walk of a `correlation_time` [s]."""
-    keep = np.exp(-0.1 / correlation_time)
-    steps = 3.0 * rng.standard_normal((FRAMES, PIXELS))
-    steps[1:] *= np.sqrt(1 - keep**2)
-    return reflected(lfilter([1.0], [1.0, -keep], steps, axis=0))
-
-
-def reflected(background: Array) -> Signals:
+def reflected(rng: np.random.Generator, **how: Any) -> Signals:
     """What glass reflects of a background."""
+    background = Background(**how).draw(TIME, PIXELS, rng)
     return REFLECTED[0] * background, REFLECTED[1] * background
 
 
@@ -58,14 +46,15 @@ def heating(time: Array) -> Signals:
         (TIME, lambda _: heating(TIME), (TOLERANCE, TOLERANCE)),
         (UNEVEN, lambda _: heating(UNEVEN), (TOLERANCE, TOLERANCE)),
         # Steps of the background by 3 K are trimmed away.
-        (TIME, lambda rng: pulses(rng, 0.02), (0.05, 0.05)),
-        (TIME, lambda rng: pulses(rng, 0.1), (0.05, 0.05)),
+        (TIME, partial(reflected, count=(0, 2), duration=(1.0, 1.1)), (0.05, 0.05)),
+        (TIME, partial(reflected, count=(3, 5), duration=(1.0, 1.1)), (0.05, 0.05)),
         # A background that never rests is told by its covariance in the bands. At 0.3 s it makes
         # the quiet band's differences 6.6 times too large; 4 % are left. At 30 s one pixel does
         # not show what the bands share, but all together do.
-        (TIME, lambda rng: walk(rng, 0.3), (0.06, TOLERANCE)),
-        (TIME, lambda rng: walk(rng, 3.0), (0.06, TOLERANCE)),
-        (TIME, lambda rng: walk(rng, 30.0), (0.06, TOLERANCE)),
+        *(
+            (TIME, partial(reflected, kind="random walk", correlation_time=time), (0.06, TOLERANCE))
+            for time in (0.3, 3.0, 30.0)
+        ),
     ],
     ids=["white", "object", "uneven", "pulses", "pulses", "walk", "walk", "walk"],
 )

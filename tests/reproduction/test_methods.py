@@ -10,11 +10,11 @@ from captures import emissivity_of
 from numpy.typing import NDArray
 from refused import refused
 
-from dbthermal import bands, mixing, planck, schema, separation, simulation
+from dbthermal import bands, mixing, planck, schema, separation
 from dbthermal import response as responses
-from dbthermal.simulation import Background, Rig
+from dbthermal.simulation import Rig
 from reproduction import experiments, methods
-from reproduction.experiments.cases import independent_pixels
+from reproduction.experiments import cases
 from reproduction.methods.bcp import BcpSettings
 from reproduction.methods.dbvt import METHOD as DBVT
 from reproduction.methods.dbvt import DbvtSettings
@@ -51,16 +51,13 @@ def solve(capture: xr.Dataset, method: str, settings: Any = None, **options: Any
     return separation.solve(capture, RESPONSE, record, settings=settings, **options)
 
 
-def drawn(time: Floats, pixels: int, rng: np.random.Generator) -> xr.Dataset:
-    """Scene of glass heated from 20 to 60 C, someone walking by."""
-    glass = independent_pixels
-    return glass(time, GLASS, Background(), pixels, rng, start=293.15, stop=333.15)
+HEATED = {"emissivity": [0.86, 0.72], "start": 20, "stop": 60}  # someone walks by
 
 
 @pytest.fixture(scope="module")
 def heated() -> xr.Dataset:
     """Scene of thirty pixels."""
-    return drawn(TIME, 30, np.random.default_rng(2))
+    return cases.simulate(HEATED, RIG, TIME, 30, seed=2)[0]
 
 
 @pytest.fixture(scope="module")
@@ -242,9 +239,7 @@ Scene = tuple[xr.Dataset, xr.Dataset, xr.Dataset]
 
 def noisy(noise: tuple[float, float], pixels: int) -> Scene:
     """Scene of pixels, its capture and its response."""
-    rig, rng = Rig(noise=noise), np.random.default_rng(41)
-    scene = drawn(LONG, pixels, rng)
-    return scene, simulation.observe(scene, rig.response(), rng), rig.response()
+    return cases.simulate(HEATED, Rig(noise=noise), LONG, pixels, seed=41)
 
 
 def errors(scene: xr.Dataset, result: xr.Dataset) -> tuple[float, float]:

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
+from attack import scenes as quadrature
 from numpy.typing import NDArray
 from scenes import held
-from scipy.constants import Boltzmann, Planck, speed_of_light
 
 from dbthermal import calibration, correction, emissivity, explorer, reporting, separation, store
 from dbthermal.__main__ import main
@@ -21,30 +21,17 @@ from dbthermal.schema import BUDGETS, COMPLETED, SHARED
 
 Floats = NDArray[np.float64]
 TIME, SHAPE = np.arange(250) / 10.0, (16, 24)
-EDGES = {"8-14": (8.0, 14.0), "9.5": (9.2, 9.8)}  # um
+BANDS = ["8-14", "9.5"]
 COUNTS, OFFSET = (115.0, 11.0), 14000.0  # count per kelvin at 300 K, count
 MIDDLE = 310.65  # of the blackbody's temperatures [K]
 NETD, ROOM = (0.03, 0.35), 295.15  # K
 LEFT, RIGHT = (0.86, 0.72), (0.93, 0.82)  # emissivities
 
 
-def radiance(band: str, temperature: Any) -> Floats:
-    """Radiance by quadrature over a band with soft edges, in any unit."""
-    wavelength = np.linspace(7.0, 15.5, 240)
-    low, high = EDGES[band]
-    passed = 1.0 / (1.0 + np.exp((low - wavelength) / 0.05))
-    passed /= 1.0 + np.exp((wavelength - high) / 0.05)
-    constant = Planck * speed_of_light / Boltzmann * 1e6  # um K
-    grid = np.linspace(240.0, 400.0, 400)
-    spectrum = passed / wavelength**5 / np.expm1(constant / np.outer(grid, wavelength))
-    return np.asarray(np.interp(temperature, grid, spectrum.sum(axis=1)))
-
-
 def counts_of(band: int, temperature: Any) -> Floats:
-    """Counts of a blackbody of a temperature [K]."""
-    name = [*EDGES][band]
-    slope = (radiance(name, 300.4) - radiance(name, 299.6)) / 0.8
-    return OFFSET + COUNTS[band] * radiance(name, temperature) / slope
+    """Counts of a blackbody of a temperature [K], by a quadrature that is not the package's."""
+    seen = quadrature.counts_of(BANDS[band], temperature) - quadrature.BLACK
+    return np.asarray(OFFSET + COUNTS[band] / quadrature.SLOPE * seen)
 
 
 def response(emissivity: float = 1.0, **stated: Any) -> xr.Dataset:
@@ -54,8 +41,8 @@ def response(emissivity: float = 1.0, **stated: Any) -> xr.Dataset:
         emissivity * counts_of(band, levels) + (1.0 - emissivity) * counts_of(band, ROOM)
         for band in range(2)
     ]
-    coords = {"band": [*EDGES], "temperature": levels}
-    noise = xr.DataArray(np.multiply(NETD, COUNTS), {"band": [*EDGES]}, "band")
+    coords = {"band": BANDS, "temperature": levels}
+    noise = xr.DataArray(np.multiply(NETD, COUNTS), {"band": BANDS}, "band")
     return calibration.fit_response(xr.DataArray(seen, coords), noise, **stated)
 
 
@@ -94,7 +81,7 @@ def glass(
             clean[:, :3, 8 * place : 8 * place + 8] = counts_of(band, temperature)
         clean += gain[band] * (clean - counts_of(band, pivot)) + offset[band] * COUNTS[band]
         movie.append(clean + NETD[band] * COUNTS[band] * rng.standard_normal(clean.shape))
-    dims, coords = ("time", "y", "x"), {"band": [*EDGES], "time": TIME}
+    dims, coords = ("time", "y", "x"), {"band": BANDS, "time": TIME}
     films = {"object_temperature": (dims, warm), "background_temperature": (dims, cold)}
     truth = xr.Dataset({**films, "emissivity": (("band", "y", "x"), values)}, coords)
     capture = xr.Dataset({"counts": (("band", *dims), np.array(movie, np.float32))}, coords)

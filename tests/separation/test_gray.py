@@ -1,7 +1,5 @@
 """Gray and nearly gray bodies: what cannot be separated has a flag, or an honest error bar."""
 
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -10,8 +8,8 @@ from attack.scenes import counts_of
 
 from dbthermal import calibration, separation, simulation
 from dbthermal.response import EXACT
-from dbthermal.simulation import Background, Rig
-from reproduction.experiments.cases import independent_pixels
+from dbthermal.simulation import Rig
+from reproduction.experiments import cases
 
 Floats = npt.NDArray[np.float64]
 Case = tuple[xr.Dataset, xr.Dataset, xr.Dataset]
@@ -81,12 +79,9 @@ def independent(noise: tuple[float, ...], emissivity: Floats, seed: int, frames:
 
 def simulated(noise: tuple[float, ...], emissivity: Floats, seed: int, frames: int = 350) -> Case:
     """The same of `simulation`, of the first pixel's emissivities; people walking by."""
-    rig, rng = Rig(bands=BANDS[: len(noise)], noise=noise), np.random.default_rng(seed)
-    value = xr.DataArray(emissivity[:, 0], dims="band", coords={"band": list(rig.bands)})
-    time, pixels = np.arange(frames) * 35.0 / frames, emissivity.shape[1]
-    ends: dict[str, Any] = {"start": 293.15, "stop": 333.15}
-    scene = independent_pixels(time, value, Background(), pixels, rng, **ends)
-    return scene, simulation.observe(scene, rig.response(), rng), rig.response()
+    rig, time = Rig(bands=BANDS[: len(noise)], noise=noise), np.arange(frames) * 35.0 / frames
+    case = {"emissivity": emissivity[:, 0].tolist(), "start": 20, "stop": 60}
+    return cases.simulate(case, rig, time, emissivity.shape[1], seed)
 
 
 GENERATORS = {"simulated": simulated, "independent": independent}

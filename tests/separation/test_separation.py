@@ -13,7 +13,7 @@ from scenes import held
 from dbthermal import response as responses
 from dbthermal import schema, separation, simulation
 from dbthermal.schema import Status
-from dbthermal.simulation import Background, Rig
+from dbthermal.simulation import Rig
 from reproduction import methods
 from reproduction.experiments import cases
 from reproduction.experiments.cases import independent_pixels
@@ -413,15 +413,11 @@ def test_noise_of_many_bands_is_found() -> None:
 
 def test_a_gray_third_band_harms_nothing() -> None:
     """A third band with the emissivity of the first leaves the object's error as it is."""
-    rig = Rig(bands=BANDS[:3], noise=(0.03, 0.35, 0.15))
-    errors = []
+    rig, errors = Rig(bands=BANDS[:3], noise=(0.03, 0.35, 0.15)), []
+    glass = {**GLASS, "emissivity": [0.86, 0.72, 0.86]}
+    scene, capture, response = cases.simulate(glass, rig, TIME, 200, seed=7)
     for bands in (2, 3):
-        value = xr.DataArray([0.86, 0.72, 0.86], dims="band", coords={"band": list(BANDS[:3])})
-        rng = np.random.default_rng(7)
-        parts = (TIME, value, Background(), 200, rng)
-        scene = independent_pixels(*parts, start=293.15, stop=333.15)
-        capture = simulation.observe(scene, rig.response(), rng).isel(band=slice(0, bands))
-        result = separation.solve(capture, rig.response())
+        result = separation.solve(capture.isel(band=slice(0, bands)), response)
         error = result["object_temperature"] - scene["object_temperature"]
         errors.append(float((error**2).mean() ** 0.5))
     assert errors[1] < 1.05 * errors[0]
@@ -506,13 +502,11 @@ def test_two_materials_stay_apart() -> None:
 
 def test_reflected_change() -> None:
     """The share of the background's change in the first band, of any object."""
-    rig, value = Rig(noise=(0.003, 0.035)), emissivity_of(0.86, 0.72)
-    for stop in (293.15, 303.15):  # a constant object, and one that warms
-        rng = np.random.default_rng(4)
-        scene = independent_pixels(TIME, value, Background(), 40, rng, start=293.15, stop=stop)
-        capture = simulation.observe(scene, rig.response(), rng)
-        result = separation.solve(capture, rig.response())
-        apparent = responses.apparent_temperature(rig.response(), capture["counts"])
+    rig = Rig(noise=(0.003, 0.035))
+    for stop in (20, 30):  # a constant object, and one that warms
+        scene, capture, response = cases.simulate({**GLASS, "stop": stop}, rig, TIME, 40, seed=4)
+        result = separation.solve(capture, response)
+        apparent = responses.apparent_temperature(response, capture["counts"])
         found = reflected_change(apparent, result)
         true = 0.14 * (
             scene["background_temperature"] - scene["background_temperature"].mean("time")
