@@ -193,16 +193,6 @@ def test_any_bytes_are_accounted_for(stream: bytes, where: list[int]) -> None:
     assert len(decoder.feed(bytes.fromhex(STATUS))) == 1
 
 
-@given(st.binary(min_size=84, max_size=84))
-def test_parsers_meet_arbitrary_data(content: bytes) -> None:
-    """A parser returns its record of any data of each length that the decoder lets pass."""
-    parsers = {**IDENTIFIERS, apt.Notice: Id.HW_RICHRESPONSE}
-    for parser, identifier in parsers.items():
-        for length in filter(None, apt.LENGTHS[identifier]):
-            message = Message(identifier, 0, 0, apt.HOST, apt.BAY_1, content[:length])
-            assert isinstance(apt.parse(parser, message), parser)
-
-
 @pytest.mark.parametrize("sent", [REPLY, ESCAPED, TEMPERATURE])
 def test_a_flipped_bit_is_never_believed(sent: bytes) -> None:
     """No frame with one wrong bit is returned, and the next good one is."""

@@ -207,28 +207,23 @@ def test_a_camera_corrects_its_offsets(opened: Opened) -> None:
 
 @opens(*CAMERAS)
 def test_a_camera_keeps_a_mode(opened: Opened) -> None:
-    """The FFC mode is set and read back; an unknown mode raises a ValueError."""
+    """The FFC mode is set and read back."""
     camera: Boson = opened.device
     before = camera.read(boson.FFC_MODE)
     camera.set(boson.FFC_MODE, boson.FfcMode.MANUAL)
     assert camera.read(boson.FFC_MODE) is boson.FfcMode.MANUAL
-    wrong: Any = 4
-    with pytest.raises(ValueError, match="Invalid FFC mode 4"):
-        camera.set(boson.FFC_MODE, wrong)
     camera.set(boson.FFC_MODE, before)
     assert camera.read(boson.FFC_MODE) is before
 
 
 @opens(*WHEELS)
 def test_a_wheel_goes_to_every_slot(opened: Opened) -> None:
-    """A homed wheel reaches every slot and reports its band; slot 7 raises a ValueError."""
+    """A homed wheel reaches every slot and reports its band."""
     wheel: FilterWheel = opened.device
     wheel.home()
     for position in (1, 4, 2, 6, 3, 5):
         wheel.move_to(position)
         assert wheel.position() == position
-    with pytest.raises(ValueError, match=r"Invalid filter position 7\. Must lie in 1 to 6"):
-        wheel.move_to(7)
     assert wheel.band() == FILTERS[5]
 
 
@@ -241,8 +236,6 @@ def test_a_logger_reads_a_room(opened: Opened) -> None:
     assert 273.0 < scan.temperature[0] < 320.0
     assert 200.0 < scan.temperature[1] < 400.0
     assert np.isnan(scan.temperature[2])
-    with pytest.raises(ValueError, match=r"Invalid channel 9\. Must lie in 1 to 8"):
-        logger.set_channels({9: "tip"})
 
 
 @opens(*VIDEOS)

@@ -66,8 +66,9 @@ def test_filters_are_called_by_their_band(bench: WheelBench) -> None:
     assert (wheel.band(), bench.world.filter_name) == ("9.5", "9.5")
     with pytest.raises(ValueError, match=r"Invalid band 'MW' .* one of \['9.5', 'LW', 'open'\]"):
         wheel.select("MW")
-    with pytest.raises(ValueError, match="Invalid filter position 0"):
-        wheel.move_to(0)
+    for wrong in (0, 7):
+        with pytest.raises(ValueError, match=f"Invalid filter position {wrong}. Must lie in"):
+            wheel.move_to(wrong)
     wheel.move_to(2)
     with pytest.raises(WheelError, match="No filter in slot 2"):
         wheel.band()
