@@ -106,10 +106,3 @@ def test_yaml_is_refused_in_one_line(
     assert str(error.value).startswith("f.yaml")
     assert "\n" not in str(error.value)
     assert len(str(error.value)) < 300
-
-
-def test_project_files_are_plain_yaml() -> None:
-    """The parameters and sessions of the project, and its list of files, are read."""
-    root = Path(__file__).parents[1]
-    files = [*(root / "params").rglob("*.yaml"), root / "data_manifest.yaml"]
-    assert all(read_yaml(path) for path in files)
