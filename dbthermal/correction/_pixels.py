@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
-from scipy.ndimage import maximum_filter1d, median_filter
+from scipy.ndimage import maximum_filter, maximum_filter1d, median_filter
 
 from dbthermal import _arrays, _numbers, _samples, schema
 from dbthermal._arrays import Array, Mask, quotient
@@ -19,7 +19,7 @@ from dbthermal.schema import Status
 Single = npt.NDArray[np.float32]
 
 _WINDOW = 5  # width of the median that gives the noise around a pixel
-_NEIGHBOURS = [(y, x) for y in range(3) for x in range(3) if (y, x) != (1, 1)]
+_NEIGHBOURS = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], dtype=bool)
 # A neighbour with this share of a jump, earlier or later by at most so long, sees it too.
 _SHARED, _REACH_SECONDS, _REACH_FRAMES = 0.3, 0.2, 5
 _LONGEST_GAP: Final = 2  # samples in a row that may be NaN within a jump
@@ -267,9 +267,6 @@ def _changes(signal: Single, stepped: Mask) -> tuple[Single, Single]:
 def _isolated(change: Single, total: Single, limit: Array, reach: int) -> Mask:
     """Pixels (y, x) that jump by more than their limit in a frame in which no neighbour does."""
     nearby = maximum_filter1d(total, 2 * reach + 1, axis=0, mode="constant")
-    nearby, (rows, columns) = np.pad(nearby, ((0, 0), (1, 1), (1, 1))), limit.shape
-    strongest = np.zeros_like(change)
-    for y, x in _NEIGHBOURS:
-        np.maximum(strongest, nearby[:, y : y + rows, x : x + columns], out=strongest)
+    strongest = maximum_filter(nearby, footprint=_NEIGHBOURS[np.newaxis], mode="constant")
     single = (change > limit) & (strongest < _SHARED * change)
     return np.asarray(np.any(single[reach:-reach], axis=0))
