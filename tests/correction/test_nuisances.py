@@ -7,12 +7,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import xarray as xr
-from captures import RIG, drift, emissivity_of, movie, still, walkers
+from captures import RIG, drift, movie, still, walkers
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from refused import refused
 
-from dbthermal import schema, separation, simulation
+from dbthermal import schema, separation
 from dbthermal.correction import (
     correct_capture,
     find_shutter,
@@ -22,10 +22,8 @@ from dbthermal.correction import (
     undo_lag,
 )
 from dbthermal.schema import Status
-from dbthermal.simulation import Background
 from reproduction import disturbances
 from reproduction.experiments import cases
-from reproduction.experiments.cases import independent_pixels
 
 
 @pytest.fixture(scope="module")
@@ -138,16 +136,13 @@ def test_events_that_overlap_are_one(runs: list[tuple[str, int, int]], segments:
 @pytest.mark.parametrize("nuisance", ["shutter", "lost frames"])
 def test_separation_stands_a_shutter_and_lost_frames(nuisance: str) -> None:
     """An event of tens of counts, or a frame of twenty lost, costs the object less than 20 %."""
-    rng, time = np.random.default_rng(11), np.arange(350) / 10.0
-    scene = independent_pixels(
-        time, emissivity_of(0.86, 0.72), Background(), 400, rng, start=293.15, stop=318.15
-    )
-    capture = simulation.observe(scene, RIG.response(), rng)
+    rng, case = np.random.default_rng(11), {"emissivity": [0.86, 0.72], "start": 20, "stop": 45}
+    scene, capture, response = cases.simulate(case, RIG, np.arange(350) / 10.0, 400, seed=11)
     if nuisance == "shutter":
         spoilt = disturbances.fire_shutter(capture, 17.0, rng, offset_std=40.0)
     else:
         spoilt = disturbances.lose_frames(capture, 0.05, rng)
-    results = [separation.solve(one, RIG.response()) for one in (capture, mark_shutter(spoilt))]
+    results = [separation.solve(one, response) for one in (capture, mark_shutter(spoilt))]
     plain, marked = (cases.score(scene, one)["object_temperature_rmse"] for one in results)
     assert float(marked) <= 1.2 * float(plain)
 
