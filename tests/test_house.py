@@ -10,11 +10,11 @@ HOUSE = Path(dbthermal.__file__).parent
 
 # Lines and modules that a room may have. A room that grows takes from another; these only fall.
 BUDGET = {
-    "": (3471, 15),
+    "": (3467, 15),
     "_cli": (1250, 5),
     "alignment": (2861, 10),
     "calibration": (740, 2),
-    "correction": (1704, 5),
+    "correction": (1701, 5),
     "emissivity": (409, 1),
     "explorer": (1254, 6),
     "figures": (580, 2),
@@ -26,7 +26,7 @@ BUDGET = {
     "simulation": (511, 1),
     "store": (1366, 6),
 }
-INSTALLED = 35_875  # lines of all rooms
+INSTALLED = 35_868  # lines of all rooms
 
 PRONOUNS = {
     *("one", "other", "others", "own", "part", "parts", "some", "here", "there", "told", "known"),
