@@ -13,7 +13,7 @@ import xarray as xr
 
 from dbthermal import _numbers, _text, schema
 from dbthermal import response as responses
-from dbthermal._arrays import Array, Mask, stride
+from dbthermal._arrays import Array, Mask, quotient, stride
 from dbthermal.explorer import _films
 from dbthermal.explorer._films import FILMS, Pane, Progress, Region, Values, input_panes
 
@@ -177,7 +177,7 @@ class View:
         Parameters
         ----------
         name, region : str, Region
-            One of `panes`, but "status"; region of the image. ValueError for another, or no pixel.
+            One of `panes`, but "status"; region in the image, of a pixel or more; else ValueError.
         pixels : {"unflagged", "measured", "all"}
             Which pixels count; see `counted`.
 
@@ -197,8 +197,9 @@ class View:
         if name == "status":
             raise ValueError("Invalid pane 'status'. Must be one with numbers.")
         schema.require(region, Region, "region")
-        if not (mask := region.mask(self.shape)).any():
-            raise ValueError(f"Invalid {region}: no pixel of the {self.shape} is inside it.")
+        outline, mask = np.array(region.points), region.mask(self.shape)
+        if outline.min() < 0 or np.any(outline > self.shape) or not mask.any():
+            raise ValueError(f"Invalid {region}. Must lie in the image {self.shape}, with a pixel.")
         box = tuple(slice(places.min(), places.max() + 1) for places in np.nonzero(mask))
         pane, where = self.pane(name, *box), (mask & self.counted(pixels))[box]
         gain, base = self._common(pane, box, where), name.removesuffix("_std")
@@ -224,8 +225,7 @@ class View:
             if pane.std:
                 std = np.sqrt(np.maximum(std**2 - shared**2, 0.0))
             std = _films.mean_std(np.where(finite, std, np.nan), common)
-            shared_std = np.sum(shared, axis=-1, where=finite) / np.maximum(result["pixels"], 1)
-            shared_std = np.where(result["pixels"] > 0, shared_std, np.nan)
+            shared_std = quotient(np.sum(shared, axis=-1, where=finite), result["pixels"], np.nan)
             return {**result, "std": np.hypot(std, shared_std), "calibration_std": shared_std}
 
         count = max(1, _SAMPLES // max(1, where.size)) if pane.kind == "film" else 1

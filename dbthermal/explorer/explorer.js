@@ -517,8 +517,10 @@ class Explorer {
     const moved = within && String(this.cursor) !== String([row, column]);
     this.cursor = within ? [row, column] : null;
     if (this.draft && this.draft.kind !== "polygon") this.draft.points = [this.draft.points[0], at.map((one, i) => clamp(one, 0, this.shape[i]))];
-    else if (this.grip?.region) {
-      this.grip.region.points = this.grip.points.map((point) => point.map((one, i) => rounded(one + at[i] - this.grip.at[i])));
+    else if (this.grip?.region) { // which stays in the image
+      const ends = [0, 1].map((i) => this.grip.points.map((point) => point[i]));
+      const step = ends.map((all, i) => clamp(at[i] - this.grip.at[i], -Math.min(...all), this.shape[i] - Math.max(...all)));
+      this.grip.region.points = this.grip.points.map((point) => point.map((one, i) => rounded(one + step[i])));
       this.askCurves();
     } else if (this.grip) this.moveZoom(this.zoom.x + this.grip.at[1] - at[1], this.zoom.y + this.grip.at[0] - at[0], this.zoom.factor);
     if (moved && !pressed) this.askProbe();

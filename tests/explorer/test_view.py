@@ -24,6 +24,7 @@ from dbthermal.schema import Status
 
 WHOLE = Region("rectangle", ((0, 0), (4, 5)))
 NOWHERE = Region("rectangle", ((0, 0), (0.2, 0.2)))
+BEYOND = Region("polygon", ((0, 0), (0, 6), (4, 3)))
 Glass = tuple[xr.Dataset, xr.Dataset, xr.Dataset]
 
 
@@ -303,7 +304,8 @@ test_bad_data_and_questions_are_refused = refused(
         *((lambda _, data=data: View(data), message) for data, message in OTHER),
         (lambda view: view.frame("object", 0), "Unknown pane 'object'"),
         (lambda view: view.frame("object_temperature", 3), "Invalid frame 3"),
-        (lambda view: view.curve("object_temperature", NOWHERE), "no pixel of the"),
+        (lambda view: view.curve("object_temperature", NOWHERE), r"Must lie in the image \(4, 5\)"),
+        (lambda view: view.curve("object_temperature", BEYOND), r"\(0.0, 6.0\).* image \(4, 5\)"),
         (lambda view: view.curve("status", WHOLE), "Invalid pane 'status'"),
         (lambda view: view.curve("object_temperature", (1, 2)), "Invalid region of type tuple"),
         (lambda view: view.counted("some"), "Unknown pixels 'some'"),
