@@ -31,6 +31,8 @@ __all__ = [
 ]
 __dir__ = __all__.copy
 
+Randomness = np.random.Generator | int  # or its seed
+
 _BACKGROUNDS: Final = ("pulses", "random walk", "still")
 _CALIBRATION_POINTS: Final = 25
 _SLOPE_TEMPERATURE: Final = 300.0
@@ -74,9 +76,10 @@ class Background:
             raise ValueError(f"Invalid duration {self.duration} s. Must be positive, not falling.")
         _numbers.real_number("correlation_time [s]", self.correlation_time, _numbers.POSITIVE)
 
-    def draw(self, time: Array, pixels: int, rng: np.random.Generator) -> Array:
+    def draw(self, time: Array, pixels: int, rng: Randomness) -> Array:
         """Background temperature (time, pixel) [K], one realisation a pixel, at times [s]."""
         _check_times(time, "a background")
+        rng = np.random.default_rng(rng)
         change = np.zeros((time.size, pixels))
         if self.kind == "pulses":
             number = rng.integers(self.count[0], self.count[1] + 1, pixels)
@@ -179,13 +182,13 @@ def walkers(
     time: Array,
     shape: tuple[int, int],
     emissivity: xr.DataArray,
-    rng: np.random.Generator,
+    rng: Randomness,
     *,
     temperatures: Sequence[float] = (295.15, 305.15, 333.15),
     crossings: int = 7,
     time_constant: float = 12.0,
 ) -> xr.Dataset:
-    """Plate, heated in its middle, that reflects people who walk by.
+    """`scene` of a plate, heated in its middle, that reflects people who walk by.
 
     Each person is an upright ellipse with a head, warmer than the room, that crosses the view once
     at a steady pace.
@@ -196,16 +199,11 @@ def walkers(
         Times (time,) [s]; rows and columns.
     emissivity : DataArray
         (band) or (band, y, x) [1].
-    rng, crossings : Generator, int
+    rng, crossings : Generator or seed, int
         Source of the paths; number of people.
     temperatures, time_constant : sequence of float, float
         Temperatures of the room, of people, and of the plate's middle at the end [K]; time constant
         of the heating [s].
-
-    Returns
-    -------
-    Dataset
-        The scene, see `scene`.
 
     Examples
     --------
@@ -221,6 +219,7 @@ def walkers(
     """
     stated = _numbers.real_numbers("temperatures [K]", temperatures, _numbers.KELVIN, (3,))
     level, skin, hottest = stated
+    rng = np.random.default_rng(rng)
     rows, columns = np.meshgrid(*(np.linspace(-1, 1, n) for n in shape), indexing="ij")
     # Object: heated in its middle.
     profile = np.exp(-(rows**2 + columns**2) / (2 * 0.5**2))
@@ -334,7 +333,7 @@ def _blackbody(response: xr.Dataset, temperature: xr.DataArray) -> list[np.ndarr
 
 
 def observe(
-    scene: xr.Dataset, response: xr.Dataset, rng: np.random.Generator, dtype: str = "float32"
+    scene: xr.Dataset, response: xr.Dataset, rng: Randomness, dtype: str = "float32"
 ) -> xr.Dataset:
     r"""Counts of a scene in a perfectly corrected rig: the stage `corrected`.
 
@@ -350,7 +349,7 @@ def observe(
         cameras see it that stand side by side.
     response : Dataset
         With `noise`, e.g. from `Rig.response`.
-    rng, dtype : Generator, str
+    rng, dtype : Generator or seed, str
         Source of the noise; floating dtype of the counts.
 
     Examples
@@ -373,6 +372,7 @@ def observe(
     reflected = _blackbody(response, background)
     schema.band_positions(scene, names, "the scene")
     # Mix emission and reflection in counts, and add noise.
+    rng = np.random.default_rng(rng)
     movie = np.empty((len(names), *scene["object_temperature"].shape), dtype=dtype)
     for index, name in enumerate(names):
         emissivity = scene["emissivity"].sel(band=name).values
@@ -386,12 +386,12 @@ def observe(
     return schema.check(xr.Dataset(variables, coords, attrs), "corrected")
 
 
-def pattern(rig: Rig, shape: tuple[int, int], rng: np.random.Generator) -> xr.Dataset:
+def pattern(rig: Rig, shape: tuple[int, int], rng: Randomness) -> xr.Dataset:
     """Random fixed pattern of a rig's detectors.
 
     Parameters
     ----------
-    rig, shape, rng : Rig, tuple of int, Generator
+    rig, shape, rng : Rig, tuple of int, Generator or seed
         Bands and deviations; rows and columns; source of all randomness.
 
     Returns
@@ -401,7 +401,7 @@ def pattern(rig: Rig, shape: tuple[int, int], rng: np.random.Generator) -> xr.Da
         relative to the mean of the live pixels, a smooth vignette (narcissus) included; `dead`
         (band, y, x).
     """
-    size = (len(rig.bands), *shape)
+    size, rng = (len(rig.bands), *shape), np.random.default_rng(rng)
     rows, columns = np.meshgrid(*(np.linspace(-1, 1, n) for n in shape), indexing="ij")
     # Random gains and offsets with a vignette, relative to the live pixels.
     vignette = rows**2 + columns**2
@@ -449,7 +449,7 @@ def capture(corrected: xr.Dataset, detector: xr.Dataset) -> xr.Dataset:
 
 
 def blackbody_movies(
-    rig: Rig, temperatures: np.ndarray, frames: int, detector: xr.Dataset, rng: np.random.Generator
+    rig: Rig, temperatures: np.ndarray, frames: int, detector: xr.Dataset, rng: Randomness
 ) -> xr.Dataset:
     """Raw movies of a blackbody that fills the view: the stage `blackbody_movies`.
 
@@ -459,7 +459,7 @@ def blackbody_movies(
         The rig, and its `pattern`.
     temperatures, frames : ndarray, int
         Blackbody temperatures [K], increasing, within the rig's range; frames at each.
-    rng : Generator
+    rng : Generator or seed
         Source of the noise.
 
     Examples
@@ -473,7 +473,7 @@ def blackbody_movies(
     >>> (rise / 20.0).values.round().tolist()  # count/K in each band
     [108.0, 11.0]
     """
-    response = rig.response()
+    response, rng = rig.response(), np.random.default_rng(rng)
     shape = (_numbers.whole_number("frames", frames, (1, 2**31)), *detector["gain"].shape[1:])
     level = xr.DataArray(temperatures, dims="temperature", name="temperature")
     movies = np.empty((len(rig.bands), len(temperatures), *shape), dtype=np.uint16)

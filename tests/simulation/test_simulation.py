@@ -213,6 +213,16 @@ def test_same_seed_same_data() -> None:
 
     xr.testing.assert_identical(record(1), record(1))
     assert float((record(1)["counts"] != record(2)["counts"]).mean()) > 0.9
+    scene, detector = simulation.walkers(TIME, SHAPE, GLASS, 1), simulation.pattern(RIG, SHAPE, 1)
+    movies = simulation.blackbody_movies(RIG, np.array([290.0, 300.0]), 2, detector, 1)
+    for name, made, *arguments in (  # a seed serves as its generator
+        ("walkers", scene, TIME, SHAPE, GLASS),
+        ("pattern", detector, RIG, SHAPE),
+        ("observe", observe(scene, KNOWN, 1), scene, KNOWN),
+        ("blackbody_movies", movies, RIG, np.array([290.0, 300.0]), 2, detector),
+    ):
+        again = getattr(simulation, name)(*arguments, np.random.default_rng(1))
+        xr.testing.assert_identical(again, made)
 
 
 def test_lag_is_that_of_a_small_body() -> None:
