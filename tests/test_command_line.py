@@ -234,7 +234,13 @@ def test_info_of_stores_and_files(results: Path) -> None:
         file["counts"], file.attrs["fps"] = film, 30.0
     stated = done(results, "info", "stated.h5")["stated.h5"]
     assert "--clock" in stated["clock"]
-    assert stated["attributes"]["warnings"] == ["'stated.h5' states 30 frames a second."]
+    (note,) = stated["attributes"]["warnings"]
+    assert note.startswith("'stated.h5' states 30 frames a second. Must be the rate of recording;")
+    for number in range(3):
+        path = results / f"dated_20241027_15595{number}.tif"
+        tifffile.imwrite(path, film[number], photometric="minisblack")
+    (dated,) = done(results, "info", "dated*.tif").values()
+    assert "are 1 s apart. Must be the rate of recording." in dated["attributes"]["warnings"][0]
     one = done(results, "info", "a.tif", "--unit", "count", "--clock", "10")["a.tif"]
     assert one["stage"] == "recording"
     assert one["attributes"]["byte_order"] == "little"
@@ -651,6 +657,7 @@ import a.tif b.tif --bands a b --clock 9 --offset 0 -o folder -> Invalid output 
 info noise.tif -> Damaged TIFF 'noise.tif': not a TIFF file: header=b'
 import folder --bands a b --clock 10 -o x.zarr -> Invalid folder .* Must be files: folder/
 info folder -> Invalid folder 'folder', no whole zarr. Must be files: folder/.*.tif
+info a.tif --clock 30 25 -> Invalid --clock of 2 values. Must be one, or one for each camera, here 1
 info nothing*.zarr -> No file or folder 'nothing.*.zarr'
 info 1714*.tif --clock 30 -> Warning: The dates of .* are 1 s apart, by --clock 0.0333 s. Must be
 info ../user?/gap[0-9]*.tif --clock 9 -> Warning: The times or numbers of 'gap8.tif to gap11.*leave

@@ -169,14 +169,13 @@ def stage_shown(command: str) -> Iterator[None]:
         showing.start()
     try:
         yield
-        seconds = time.monotonic() - start
     finally:
         ended.set()
         if is_terminal:
             showing.join()
             stream.write = write
             write("\r\x1b[K")
-    write(f"{command}: {seconds:.1f} s\n")
+    write(f"{command}: {time.monotonic() - start:.1f} s\n")
 
 
 def _stage(thread: int) -> str:

@@ -40,7 +40,7 @@ PICTURES: Final = (".png", ".pdf", ".svg")
 ANIMATED: Final = (".gif", ".webp")
 NO_TABLES: Final = (".tif", ".nc", *PICTURES, *ANIMATED)
 _UNEQUAL: Final = 0.05  # of the duration, by which two cameras' recordings may differ
-_BY_CLOCK: Final = ("seconds", "frame_rate_Hz")
+_NO_RATE: Final = 1e-6  # that no file states [Hz]
 # Options of files, of which each kind takes those that its reader has, and the last two.
 _FORM: Final = "clock unit shape byte_order header frame_header variable simulated bands offset"
 _NOT_RECORDED: Final = {"dry_run", "json", "overwrite", "place", "traceback"}
@@ -165,17 +165,13 @@ def capture(paths: list[Path], options: Namespace, offset: Any) -> xr.Dataset:
     """Capture of two bands or more: a store, or the files of each camera, with '+' between."""
     if len(paths) == 1 and _is_store(paths[0]):
         return staged(Namespace(capture=paths[0]), capture="capture|corrected")[0]
-    number, cameras = len(options.bands or "ab"), _cameras(paths, options.bands or "ab")
+    number, cameras = len(options.bands or "ab"), _cameras(paths, options)
     if len(cameras) < 2 or paths.count(PLUS) not in {0, len(cameras) - 1}:
         label = f"Invalid {len(paths)} files {[*map(str, paths[:3])]}: of which camera is not clear"
         rule = "a file of two bands twice, with --variable for each"
         raise ValueError(f"{label}. Must be one of each camera, or: a*.tif + b*.tif; {rule}.")
     if options.bands is None:
         raise ValueError("Missing --bands. Must name all, such as: --bands 8-14 9.5.")
-    for name, values in {"clock": options.clock or (), "variable": options.variable or ()}.items():
-        if len(values) not in {0, 1, len(cameras)}:
-            label = f"Invalid --{name} of {len(values)} values"
-            raise ValueError(f"{label}. Must be one, or one for each camera.")
     if number != len(cameras):
         label = f"Invalid --bands of {number} names: {', '.join(options.bands)}"
         raise ValueError(f"{label}. Must be {len(cameras)}, one for each camera, with spaces.")
@@ -184,11 +180,17 @@ def capture(paths: list[Path], options: Namespace, offset: Any) -> xr.Dataset:
         return readers.two_bands(*movies, bands=options.bands, offset=offset)
 
 
-def _cameras(paths: list[Path], bands: Sequence[str] = "ab") -> list[list[Path]]:
-    """Files of each camera, with '+' between; without it, of two files or of all bands, one."""
-    if PLUS not in paths and len(paths) in {2, len(bands)}:
-        return [[path] for path in paths]
-    return [[*group] for is_plus, group in groupby(paths, PLUS.__eq__) if not is_plus]
+def _cameras(paths: list[Path], options: Namespace) -> list[list[Path]]:
+    """Files of each camera, with '+' between; without it, of two, of all bands or stores, one."""
+    number = len(vars(options).get("bands") or "ab")
+    cameras = [[*group] for is_plus, group in groupby(paths, PLUS.__eq__) if not is_plus]
+    if PLUS not in paths and (len(paths) in {2, number} or all(map(_is_store, paths))):
+        cameras = [[path] for path in paths]
+    for name, values in {"clock": options.clock or (), "variable": options.variable or ()}.items():
+        if len(values) not in {0, 1, len(cameras)}:
+            label = f"Invalid --{name} of {len(values)} values"
+            raise ValueError(f"{label}. Must be one, or one for each camera, here {len(cameras)}.")
+    return cameras
 
 
 def _room(options: Namespace) -> Path:
@@ -243,7 +245,7 @@ def provenance(options: Namespace) -> dict[str, Any]:
 
 def info(options: Namespace) -> dict[str, Any]:
     """Command `info`; it describes each of several stores."""
-    cameras = _cameras(options.files, options.files if all(map(_is_store, options.files)) else "ab")
+    cameras = _cameras(options.files, options)
     keys = [f"{it[0]}{f' ({n + 1})' * (cameras.count(it) > 1)}" for n, it in enumerate(cameras)]
     return {key: _described(cameras[n], options, n) for n, key in enumerate(keys)}
 
@@ -259,10 +261,10 @@ def _described(paths: list[Path], options: Namespace, camera: int) -> dict[str, 
             raise
     with catch_warnings():
         filterwarnings("ignore", ".*, (and|by) clock= ")  # of a rate that is not this one
-        lines = _described(paths, Namespace(**{**vars(options), "clock": [1.0]}), camera)
-    lines = {name: value for name, value in lines.items() if name not in _BY_CLOCK}
-    notes = lines["attributes"].pop("warnings", [])
-    lines["attributes"]["warnings"] = [re.sub(", (and|by) clock= .*", ".", it) for it in notes]
+        lines = _described(paths, Namespace(**{**vars(options), "clock": [_NO_RATE]}), camera)
+    lines = {it: value for it, value in lines.items() if it not in {"seconds", "frame_rate_Hz"}}
+    notes = lines["attributes"].get("warnings", [])
+    notes[:] = [re.sub(", (and|by) clock= .*?[.] ", ". ", it) for it in notes]
     return lines | {"clock": "not in the file: state the frame rate by --clock"}
 
 

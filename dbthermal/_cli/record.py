@@ -45,8 +45,7 @@ def _say(text: str, *, end: str = "\n", file: TextIO | None = None) -> None:
     try:
         print(text, end=end, file=stream, flush=True)
     except OSError:
-        with Path(os.devnull).open("wb") as nothing:
-            os.dup2(nothing.fileno(), stream.fileno())
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _run(session: Session, folder: Path, *, dry: bool) -> int:
