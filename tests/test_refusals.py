@@ -223,6 +223,10 @@ CASES: list[tuple[Call, str]] = [
     (lambda: separation.separate(CAPTURE, CAMERA, workers=cast(Any, 1.5)), "workers 1.5.*whole"),
     (lambda: separation.separate(CAPTURE, CAMERA, outdoors=cast(Any, "no")), "outdoors 'no'.*True"),
     (lambda: separation.without_calibration(CAPTURE), "separated"),
+    (
+        lambda: separation.without_calibration(RESULT.sel(band=["9.5"]), drift=False),
+        "Missing band '8-14' in the result",
+    ),
     (lambda: separation.solve(RAW, CAMERA), "correct_capture.*correction.corrected_by"),
     (lambda: solve("magic"), r"Unknown method 'magic'. Must be one of \['subspace', 'calibrated'"),
     (lambda: solve(response_kind="cubic"), "Unknown kind of response 'cubic'"),

@@ -31,7 +31,7 @@ import xarray as xr
 
 from dbthermal import _numbers, schema
 from dbthermal import response as responses
-from dbthermal._arrays import Array, empty, release
+from dbthermal._arrays import Array, empty, quotient, release
 from dbthermal.emissivity import Colour
 from dbthermal.response import Accuracy
 from dbthermal.schema import BUDGETS, CALIBRATION, CAUSES
@@ -102,9 +102,9 @@ def _drift(result: xr.Dataset) -> Array:
     """Deviation (y, x) of the background by its drift, for a contrast of 1 K to the object."""
     if "drift_std" not in result:
         return np.zeros(result["status"].shape)
-    reflectivity = 1.0 - result["emissivity"].sel(band=result.attrs["reference_band"]).values
-    drift = result["drift_std"].values / np.where(reflectivity > 0.0, reflectivity, np.nan)
-    return np.asarray(np.nan_to_num(drift), dtype=np.float64)
+    places = schema.band_positions(result, [str(result.attrs.get("reference_band"))], "the result")
+    reflectivity = 1.0 - result["emissivity"].values[places[0]]
+    return np.asarray(quotient(np.nan_to_num(result["drift_std"].values), reflectivity, 0.0), float)
 
 
 def _add(
