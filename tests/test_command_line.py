@@ -806,7 +806,7 @@ def test_a_warning_is_said_once(results: Path) -> None:
         tifffile.imwrite(results / f"padded_{name}.tif", stack, photometric="minisblack")
     at = "calibrate --at 5C padded_a5.tif padded_b5.tif --at 70C padded_a70.tif padded_b70.tif"
     _, _, error = said(results, *at.split(), *STATED, "-o", "border.zarr", action="always")
-    assert error.count("Warning: 3 rows and 0 columns of band") == 2
+    assert error.count("Warning: Rows (3), columns (0) of band") == 2
 
 
 def test_bash_completes_commands_and_options(tmp_path: Path) -> None:

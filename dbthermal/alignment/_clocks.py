@@ -208,7 +208,7 @@ def interpolation(stamps: Array, present: Mask, wanted: Array, segment: Whole) -
     usable = np.flatnonzero(present & np.isfinite(stamps))
     if usable.size < _MINIMUM_FRAMES:
         rule = f"at least {_MINIMUM_FRAMES}: the others are NaN or copies of the frame before"
-        raise ValueError(f"Invalid capture of {usable.size} valid frames. Must be {rule}.")
+        raise ValueError(f"Invalid number {usable.size} of valid frames. Must be {rule}.")
     times, step = stamps[usable], frame_period(np.where(present, stamps, np.nan))
     # Frames before and after each wanted time, and weight of the frame after.
     right = np.clip(np.searchsorted(times, wanted), 1, usable.size - 1)

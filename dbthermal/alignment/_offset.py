@@ -197,7 +197,7 @@ def check(corrected: xr.Dataset, band: str | None, search: int) -> int:
     frames = counts.sizes["time"]
     if frames < _MINIMUM_FRAMES:
         rule = f"Must have at least {_MINIMUM_FRAMES}"
-        raise ValueError(f"Invalid capture of {frames} frames for a time offset. {rule}.")
+        raise ValueError(f"Invalid number {frames} of frames for a time offset. {rule}.")
     _numbers.whole_number("search [frame]", search, (1, frames // 4))
     (place,) = schema.band_positions(counts, [names[1] if band is None else band], "the capture")
     if place == 0:
@@ -224,7 +224,7 @@ def sample(corrected: xr.Dataset) -> Array:
         usable &= np.all(np.isfinite(recorded), axis=0) & changes
     if usable.sum() < _GROUPS:
         rule = f"Must be at least {_GROUPS} that are finite and change"
-        raise ValueError(f"Invalid capture of {usable.sum()} usable pixels. {rule}.")
+        raise ValueError(f"Invalid number {usable.sum()} of usable pixels. {rule}.")
     return counts[:, :, usable]
 
 
@@ -289,9 +289,9 @@ def _common(shared: _Pair, names: list[str]) -> Mask:
             f"share at least {100 * _COMMON:.0f} %, for a time offset; give the offset."
         )
     if common.sum() < _MINIMUM_FRAMES:
-        label = f"{common.sum()} valid frames of both bands '{names[0]}' and '{names[1]}'"
+        label = f"{common.sum()} of valid frames of both bands '{names[0]}' and '{names[1]}'"
         rule = f"Must be at least {_MINIMUM_FRAMES} for a time offset"
-        raise ValueError(f"Invalid capture of {label}. {rule}.")
+        raise ValueError(f"Invalid number {label}. {rule}.")
     return np.asarray(common)
 
 

@@ -204,7 +204,7 @@ def _frames(counts: xr.DataArray) -> npt.NDArray[np.intp]:
     used = np.flatnonzero(share > _COMMON)
     if used.size < noises.MINIMUM_FRAMES:
         rule = f"Must be at least {noises.MINIMUM_FRAMES}"
-        raise ValueError(f"Invalid capture of {used.size} frames that all bands have. {rule}.")
+        raise ValueError(f"Invalid number {used.size} of frames that all bands have. {rule}.")
     return used
 
 

@@ -50,7 +50,7 @@ _STEP: Final = 2.5
 # product of the signs, from which the scene has stepped.
 _AT_ONCE, _ALSO, _BOTH, _SIGNS = 0.7, 0.4, 1.5, 0.15
 _SHOWN: Final = 10  # runs of bad frames that are named
-_BAD: Final = "{} frames of band '{}' are left out, which those before and after do not predict: {}"
+_BAD: Final = "Frames of band '{}' are left out, which those around do not predict, {} in all: {}"
 _CHANGED: Final = (
     "The fixed pattern of band '{}' changes at frame {}, as by a shutter event that is not marked: "
     "a new segment begins there"
@@ -77,7 +77,7 @@ class Findings:
             ]
             shown = "; ".join(runs[:_SHOWN] + ["..."] * (len(runs) > _SHOWN))
             if runs:
-                said.append(_BAD.format(bad.sum(), band, shown))
+                said.append(_BAD.format(band, bad.sum(), shown))
             said += [_CHANGED.format(band, frame) for frame in np.flatnonzero(steps)]
         return said
 

@@ -349,7 +349,7 @@ def clocked(counts: Counts, clock: Any, name: str, *sentences: str, **attrs: str
     if (late := np.flatnonzero(made["frame_flags"].values & FileFlag.FRAMES_LOST_BEFORE)).size:
         steps = np.diff(seconds)
         missing = np.rint(steps[late - 1] / np.percentile(steps, 50, method="lower") - 1.0).sum()
-        label = f"The times or numbers of '{name}' leave out {missing:.0f} frames"
+        label = f"The times or numbers of '{name}' leave out frames, {missing:.0f} in all"
         rule = "Must be all that were recorded: there are gaps in time in their place"
         doubts.append(f"{label}, the first before frame {late[0]}. {rule}.")
     return schema.warned(made, *sentences, *doubts)

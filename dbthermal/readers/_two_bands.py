@@ -154,9 +154,7 @@ def _unchanging(samples: list[npt.NDArray[np.uint16]], names: list[str]) -> list
     for still, name in zip(stills, names, strict=True):
         rows, columns = (int(still.all(axis=axis).sum()) for axis in (1, 0))
         if rows < len(still) and rows + columns:
-            label = (
-                f"{rows} rows and {columns} columns of band '{name}' have one value in all frames"
-            )
+            label = f"Rows ({rows}), columns ({columns}) of band '{name}' never change"
             sentences.append(f"{label}: a border. Its pixels are flagged; better cropped.")
     drawn = np.all(stills, axis=0)
     drawn = drawn[~drawn.all(axis=1)][:, ~drawn.all(axis=0)]

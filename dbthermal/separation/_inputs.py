@@ -160,7 +160,7 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
         raise ValueError(f"Invalid bands {bands} for method '{name}'. Must be {rule}.")
     if (frames := corrected.sizes["time"]) < method.minimum_frames:
         rule = f"Must have at least {method.minimum_frames}."
-        raise ValueError(f"Invalid capture of {frames} frames for method '{name}'. {rule}")
+        raise ValueError(f"Invalid number {frames} of frames for method '{name}'. {rule}")
     if emissivity is not None and not method.knows_emissivity:
         raise ValueError(f"Invalid emissivity for method '{name}', which estimates it. Omit it.")
     if emissivity is None and method.knows_emissivity:

@@ -156,7 +156,7 @@ def test_frames_without_a_scene_are_left_out(seed: int, spoil: Event) -> None:
         assert len(frames - bad) <= 2  # beside a shutter, where people move
     assert not (result["status"] & np.uint32(Status.SATURATED)).any()
     assert "are left out" in said
-    assert spoil is not black or "2 frames of band '8-14' are left out" in said  # one is a copy
+    assert spoil is not black or "predict, 2 in all" in said  # one is a copy
     renewed = spoil in {shutter, shutters}
     assert ("a shutter that is seen" in said) == renewed
     assert np.unique(result["segment"]).size == 1 + renewed

@@ -246,7 +246,7 @@ def test_a_gap_in_the_times_is_named() -> None:
     dates[2:] += np.timedelta64(1, "h")
     array = xr.DataArray(scene(6), {"time": dates}, ("time", "y", "x"))
     with pytest.warns(
-        UserWarning, match="'array' leave out 36000 frames, the first before frame 2"
+        UserWarning, match="'array' leave out frames, 36000 in all, the first before frame 2"
     ):
         assert_allclose(read(array, clock=None).time[[1, 2]], [0.1, 3600.2])
 

@@ -56,7 +56,7 @@ def test_a_border_is_noticed() -> None:
     pads = ((0, 0), (4, 4), (0, 3))
     padded = [np.pad(scene(20) + n, pads, constant_values=n) for n in (0, 1)]
     pair = [readers.array(one.astype("u2"), unit="count", clock=10.0) for one in padded]
-    expected = "8 rows and 3 columns of band '9.5' have one value in all frames: a border"
+    expected = "Rows (8), columns (3) of band '9.5' never change: a border"
     with pytest.warns(UserWarning, match="a border") as told:
         capture = readers.two_bands(*pair, bands=BANDS, offset=0.0)
     assert [str(one.message).startswith(expected) for one in told] == [False, True]

@@ -271,7 +271,7 @@ def test_demands_are_said(pair: Pair, method: str) -> None:
     record = methods.get_method(method)
     if record.minimum_frames > 1:
         frames = record.minimum_frames - 1
-        message = f"Invalid capture of {frames} frames for method '{method}'. Must have at least"
+        message = f"Invalid number {frames} of frames for method '{method}'. Must have at least"
         with pytest.raises(ValueError, match=message):
             solve(pair[0].isel(time=slice(0, frames)), pair[1], method)
     wrong, message = (None, "Missing") if record.knows_emissivity else (GLASS, "Invalid")
