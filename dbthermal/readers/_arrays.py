@@ -28,9 +28,8 @@ from dbthermal import _numbers, _text, schema
 from dbthermal.readers import _formats, _recording, _variables
 from dbthermal.readers._recording import MEMORY, Clock
 
-# Names of times, perhaps with their unit: of an array beside another, and of a dim or array.
-_BESIDE: Final = re.compile("((frame_?)?time(s|_?stamps?)?|t(?=_))(_(s|ms|us|ns))?", re.IGNORECASE)
-_TIMES: Final = re.compile(f"{_BESIDE.pattern}|t", re.IGNORECASE)
+# Names of times, perhaps with their unit, of an array beside another, or a dim.
+_TIMES: Final = re.compile("((frame_?)?time(s|_?stamps?)?|t)(_(s|ms|us|ns))?", re.IGNORECASE)
 # Names of dims by their place, and dims of an array without names, in any case of letters.
 _DIMS: Final = (f"{_TIMES.pattern}|frames?|images?", "y|rows?|height", "x|col(umn)?s?|width")
 _WITHOUT_NAME: Final = r"||None|(phony_)?dim_\d+"
@@ -252,7 +251,7 @@ def _times_of(arrays: dict[str, Any], name: str, path: Path) -> dict[str, Any]:
     named = {
         key: array
         for (place, key), array in lines.items()
-        if _BESIDE.fullmatch(key) and (place == group or f"{place}/".startswith(around))
+        if _TIMES.fullmatch(key) and (place == group or f"{place}/".startswith(around))
     }
     for key, number in ((key, times.size) for key, times in named.items()):
         if number != frames and number in image:

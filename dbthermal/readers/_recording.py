@@ -77,7 +77,7 @@ def numbered(paths: Sequence[Path]) -> tuple[Array | None, float]:
     if len({*map(len, numbers)}) > 1 or len(paths) < 3:
         return None, 0.0
     table = np.array(numbers, dtype=np.float64)
-    moments = np.array([_moment(path.stem) for path in paths])
+    moments = np.array([moment(path.stem) for path in paths])
     is_dated, counting = np.isfinite(moments).all(), np.flatnonzero(np.ptp(table, axis=0))
     if not is_dated and counting.size != 1:  # parts of a recording
         return None, 0.0
@@ -96,14 +96,14 @@ def numbered(paths: Sequence[Path]) -> tuple[Array | None, float]:
     return np.cumsum(np.append(0.0, places)) if gaps else None, is_clock * usual
 
 
-def _moment(stem: str) -> float:
-    """Time at which a name ends, of a date or in seconds since 1970 [s]; NaN for other names."""
-    if (match := _DATE.search(stem)) is None:
+def moment(text: str) -> float:
+    """Time at which a text ends, of a date or in seconds since 1970 [s]; NaN for other texts."""
+    if (match := _DATE.search(text)) is None:
         return np.nan
     *whole, fraction, unix, behind = match.groups("")
     with suppress(ValueError):
-        moment = datetime.strptime("".join(whole), "%Y%m%d%H%M%S").replace(tzinfo=UTC)
-        return moment.timestamp() + float(f"0.{fraction}")
+        second = datetime.strptime("".join(whole), "%Y%m%d%H%M%S").replace(tzinfo=UTC)
+        return second.timestamp() + float(f"0.{fraction}")
     return float(f"{unix}.{behind.removeprefix('.')}") if unix else np.nan
 
 

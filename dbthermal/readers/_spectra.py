@@ -8,7 +8,7 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 import xarray as xr
@@ -85,18 +85,8 @@ def ecostress(path: str | Path) -> xr.Dataset:
             label = f"{key} is {value:g}, declared '{declared}'"
             raise ValueError(f"Truncated or altered '{path.name}': {label}. Must be equal.")
     notes = {note: header.get(key, "") for note, key in NOTES.items()}
-    return spectrum(wavelength, 1 - reflectance / 100, notes, File(path.name, rows))
-
-
-class File(NamedTuple):
-    """Name and rows of a table."""
-
-    name: str
-    rows: Sequence[_text.Row]
-
-    def at(self, index: np.integer[Any]) -> str:
-        """Place of a row in the file."""
-        return _text.at(self.name, self.rows[int(index)][0])
+    places = [_text.at(path.name, number) for number, _ in rows]
+    return spectrum(wavelength, 1 - reflectance / 100, notes, path.name, places)
 
 
 def _header(lines: Sequence[str], path: Path) -> dict[str, str]:
@@ -115,25 +105,25 @@ def _header(lines: Sequence[str], path: Path) -> dict[str, str]:
 
 
 def spectrum(
-    wavelength: Array, emissivity: Array, notes: Mapping[str, str], file: File
+    wavelength: Array, emissivity: Array, notes: Mapping[str, str], name: str, places: Sequence[str]
 ) -> xr.Dataset:
     """Dataset of a spectrum given over increasing or decreasing wavelength [micrometre]."""
     # Values in range, over wavelengths in order.
-    name, limits = f"'{notes['name']}' of '{file.name}'", (1e-3, 1e3, *schema.EMISSIVITY_LIMITS)
+    label, limits = f"'{notes['name']}' of '{name}'", (1e-3, 1e3, *schema.EMISSIVITY_LIMITS)
     quantities = [("wavelength", wavelength, *limits[:2]), ("emissivity", emissivity, *limits[2:])]
     for quantity, values, lowest, highest in quantities:
         for i in np.flatnonzero(~((values >= lowest) & (values <= highest))):
-            message = f"Invalid {quantity} {values[i]:g} in {name}"
-            raise ValueError(f"{file.at(i)}: {message}. Must lie in [{lowest}, {highest}].")
+            message = f"Invalid {quantity} {values[i]:g} in {label}"
+            raise ValueError(f"{places[int(i)]}: {message}. Must lie in [{lowest}, {highest}].")
     falling = wavelength[0] > wavelength[-1]
     for i in np.flatnonzero(np.diff(-wavelength if falling else wavelength) <= 0):
         message = f"{wavelength[i]:g} micrometres is followed by one not beyond it"
         rule = "Must increase or decrease strictly"
-        raise ValueError(f"{file.at(i)}: Unordered wavelength in {name}: {message}. {rule}.")
+        raise ValueError(f"{places[int(i)]}: Unordered wavelength in {label}: {message}. {rule}.")
     # Spectrum over rising wavelengths.
     if falling:
         wavelength, emissivity = wavelength[::-1], emissivity[::-1]
-    attrs: dict[str, Any] = {**dict.fromkeys(NOTES, ""), **notes, "source": file.name}
+    attrs: dict[str, Any] = {**dict.fromkeys(NOTES, ""), **notes, "source": name}
     attrs["unphysical_values"] = int(np.sum((emissivity < 0) | (emissivity > 1)))
     axes = {"wavelength": ("wavelength", wavelength * 1e-6, schema.COORDINATES["wavelength"].attrs)}
     variables = schema.variables("spectrum", {"emissivity": emissivity})

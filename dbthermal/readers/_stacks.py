@@ -62,8 +62,8 @@ def tiff(
 ) -> xr.Dataset:
     """Counts of a TIFF or BigTIFF stack, or of one TIFF or PNG a frame, in 16 bits.
 
-    Such files tell no unit, and rarely times. An interval of frames, or times, in a description of
-    ImageJ or OME must agree with the clock, or serves as the clock; "origin: simulated" is kept.
+    Such files tell no unit, and rarely times. An interval of frames, or times, by ImageJ, OME or
+    Micro-Manager, or dates finer than 1 s, must agree with the clock, or serve as the clock.
 
     OSError if a file cannot be opened, ImportError without the extra ``recordings``; TypeError or
     ValueError if the unit is another one; a file is damaged, or holds two bands or other axes; a
@@ -117,8 +117,9 @@ def tiff(
     shape = (sum(page.images for page in pages), *pages[0].shape)
     stored = sum(length for page in pages for _, length in page.spans)
     _recording.check_memory(shape, memory, name, stored)
-    seconds, sentences = _times(pages[0].description, shape[0], clock, name)
-    places, step = _recording.numbered(paths) if np.ndim(np.asarray(clock)) == 0 else (None, 0.0)
+    seconds, sentences = _times(pages, clock, name)
+    is_even = np.ndim(np.asarray(clock)) == 0 and np.allclose(np.diff(seconds), seconds[1:2])
+    places, step = _recording.numbered(paths) if is_even else (None, 0.0)
     groups = groupby(pages, attrgetter("path"))
     size, *lengths = (sum(page.images for page in group) for _, group in groups)
     if step and abs(step / (size * seconds[1]) - 1) > 0.5:  # as of times in a file
@@ -151,17 +152,25 @@ def tiff(
     return _recording.clocked(counts, seconds, name, *sentences, **decided)
 
 
-def _times(text: str, frames: int, clock: Clock | None, name: str) -> tuple[Array, list[str]]:
-    """Seconds by the clock, or else a description, which must agree; sentence on another rate."""
+def _times(pages: "list[_Page]", clock: Clock | None, name: str) -> tuple[Array, list[str]]:
+    """Seconds by the clock, or else by pages or a description, which must agree; sentences."""
+    text, frames = pages[0].description, sum(page.images for page in pages)
+    span = np.ptp(moments := np.array([page.moment for page in pages]))
     unit = (_TIME_UNIT.findall(text) or ["s"])[0]
     interval, rate = (float((form.findall(text) or [0])[0]) for form in (_INTERVAL, _RATE))
     times = np.array(_TIMES.findall(text), dtype=np.float64)
     times = times if times.size == frames else np.multiply(interval, np.arange(frames))
+    if span > 0.0 and moments.size == frames and np.any(moments % 1.0):  # finer than seconds
+        times, unit = moments, "s"
     if times.any():
         stated = _recording.check_times(times, unit, clock, name)
         return _recording.stamps(stated if clock is None else clock, frames, name), []
     seconds = _recording.stamps(clock, frames, name)
-    return seconds, _recording.another_rate(rate, seconds, name)
+    sentences = _recording.another_rate(rate, seconds, name)
+    if span > 0.0 and abs(span - seconds[-1]) > 1.0:
+        label = f"The dates of '{name}' span {span:g} s, by clock= {seconds[-1]:.3g} s"
+        sentences.append(f"{label}. Must be the rate of recording.")
+    return seconds, sentences
 
 
 class _Page(NamedTuple):
@@ -178,6 +187,7 @@ class _Page(NamedTuple):
     tile: int = 0  # columns of a tile, of which a row of images is made; 0 of strips
     differences: bool = False  # from column to column
     description: str = ""
+    moment: float = np.nan  # by Micro-Manager or a date [s]
 
 
 def _values(page: _Page) -> Iterator[Counts]:
@@ -324,7 +334,10 @@ def _page(page: Any, path: Path, order: str, number: int) -> _Page:
         label = f"{pieces} tiles of {rows} x {tile} of page {number}"
         raise ValueError(f"Invalid {label}. Must be at most {most} bytes, of {shape}.")
     form = (codec, rows, tile, predictor == 2)
-    return _Page(path, shape, 1, order, spans, _no_data(page, number), *form)
+    about, date = (page.tags.valueof(tag) for tag in ("MicroManagerMetadata", "DateTime"))
+    elapsed = about.get("ElapsedTime-ms") if isinstance(about, dict) else None
+    moment = _recording.moment(str(date)) if elapsed is None else 1e-3 * float(elapsed)
+    return _Page(path, shape, 1, order, spans, _no_data(page, number), *form, moment=moment)
 
 
 def _no_data(page: Any, number: int) -> list[float]:

@@ -3,13 +3,14 @@
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
 
 from dbthermal import _text as texts
 from dbthermal._arrays import Array
-from dbthermal.readers._spectra import File, spectrum
+from dbthermal.readers._spectra import spectrum
 
 # Least and largest wavelength [micrometre] that a table must reach: a file that was cut is refused.
 _SLUM, _UCSB = (8.005, 13.99), (3.665, 14.5)
@@ -65,6 +66,17 @@ def ucsb(path: str | Path) -> xr.Dataset:
     return _reaching(wavelength, emissivity, notes, file, _UCSB)
 
 
+class File(NamedTuple):
+    """Name and rows of a table."""
+
+    name: str
+    rows: list[texts.Row]
+
+    def at(self, index: int | np.integer[Any]) -> str:
+        """Place of a row in the file."""
+        return texts.at(self.name, self.rows[int(index)][0])
+
+
 def _table(path: Path) -> tuple[list[str], list[texts.Row]]:
     """Titles and rows of a table; the titles are empty if the file is."""
     (_, titles), *rows = texts.table_rows(texts.read_text(path), path.name) or [(1, [""])]
@@ -79,7 +91,8 @@ def _reaching(
     reach: tuple[float, float],
 ) -> xr.Dataset:
     """Spectrum of a table; ValueError if rows are missing, at the ends or between two others."""
-    result = spectrum(wavelength, emissivity, notes, file)
+    places = [file.at(i) for i in range(len(file.rows))]
+    result = spectrum(wavelength, emissivity, notes, file.name, places)
     (low, high), (shortest, longest) = (wavelength.min(), wavelength.max()), reach
     if low > shortest or high < longest:
         raise ValueError(

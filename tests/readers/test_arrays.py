@@ -58,7 +58,11 @@ def test_times_of_npz_and_arrays_of_other_libraries(tmp_path: Path) -> None:
     assert_allclose(read(tmp_path / "a.npz", clock=None).time, [0.0, 0.1, 0.24])
     with pytest.raises(ValueError, match=r"Invalid times of 'a\.npz'.* Must agree to half a frame"):
         read(tmp_path / "a.npz", clock=30.0)
-    for times in ({"time_ns": [7e9, 7.1e9, 7.24e9]}, {"t_ms": [0, 100, 240]}):  # unit by the name
+    for times in (
+        {"time_ns": [7e9, 7.1e9, 7.24e9]},
+        {"t_ms": [0, 100, 240]},
+        {"t": [3, 3.1, 3.24]},
+    ):
         np.savez(tmp_path / "a.npz", frames=scene(), **times)
         assert_allclose(read(tmp_path / "a.npz", clock=None).time, [0.0, 0.1, 0.24])
     assert_array_equal(read([*scene()]).counts, scene())

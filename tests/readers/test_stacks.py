@@ -260,6 +260,30 @@ def test_intervals_of_a_description(tmp_path: Path, options: Any, agrees: bool) 
             read(path)
 
 
+def test_times_of_pages(tmp_path: Path) -> None:
+    """Those by Micro-Manager and dates with fractions are a clock; with dates it is compared."""
+
+    def pages(code: int, form: str, *times: object) -> Path:
+        with tifffile.TiffWriter(tmp_path / "a.tif") as file:
+            for image, time in zip(scene(), times, strict=True):
+                tag: Any = (code, "s", 0, form.format(time), True)
+                file.write(image, photometric="minisblack", metadata=None, extratags=[tag])
+        return tmp_path / "a.tif"
+
+    for path in (
+        pages(51123, '{{"ElapsedTime-ms": {}}}', 7.5, 107.5, 218),
+        pages(306, "2024:10:27 15:59:{}", "07.4", "07.5", "07.6105"),
+    ):
+        assert_allclose(read(path, clock=None)["time"], [0.0, 0.1, 0.2105], atol=1e-6)  # [s]
+        assert_array_equal(read(path)["time"], np.arange(3) / 10)
+        with pytest.raises(ValueError, match=r"Invalid times of .* Must agree to half a frame"):
+            read(path, clock=30.0)
+    path = pages(306, "2024:10:27 15:59:{}", "07", "08", "09")
+    assert_array_equal(read(path, clock=1.0)["time"], np.arange(3))
+    with pytest.warns(UserWarning, match=r"dates of 'a\.tif' span 2 s, by clock= 0\.2 s"):
+        read(path)
+
+
 def test_frame_rate_of_a_description(tmp_path: Path) -> None:
     """A frame rate may be that of playing: another one than the clock's is a warning."""
     for text, warned in (("fps=10.0", False), ("fps=30", True), ('{"frame_rate": 5}', True)):
