@@ -103,7 +103,7 @@ def at(source: str, line: int, column: int | None = None) -> str:
 
 def shown(value: object) -> str:
     """Value as a message shows it: in one line, and cut where it is long."""
-    text = repr(value)
+    text = repr(value).replace("\n", " ")  # of arrays and datasets
     return text if len(text) <= SHOWN else f"{text[:SHOWN]}... ({len(text)} characters)"
 
 

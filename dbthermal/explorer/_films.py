@@ -53,7 +53,7 @@ class Pane:
 
     def unit(self, *, celsius: bool) -> tuple[str, float]:
         """Unit of the shown values, and the offset that is subtracted."""
-        if self.absolute and celsius:
+        if self.absolute and _numbers.truth_value("celsius", celsius):
             return "\N{DEGREE SIGN}C", zero_Celsius
         return self.units, 0.0
 

@@ -123,8 +123,7 @@ class View:
 
     def frame(self, name: str, index: int) -> Values:
         """Values (y, x) of a pane at a frame, from 0; ValueError if there is no such frame."""
-        if not 0 <= index < self.time.size:
-            raise ValueError(f"Invalid frame {index}. Must be from 0 to {self.time.size - 1}.")
+        _numbers.whole_number("frame", index, (0, self.time.size - 1))
         return np.asarray(self.pane(name).read(slice(index, index + 1))[0])
 
     @cached_property

@@ -112,7 +112,7 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
     ...     "<h1>Wall</h1>" in page.read_text("utf-8")
     True
     """
-    if Path(path).suffix != ".html":
+    if _text.as_path(path).suffix != ".html":
         raise ValueError(f"Invalid path '{path}'. Must end in '.html'.")
     view = View(data, capture, response)
     if "object_temperature" not in view.panes:

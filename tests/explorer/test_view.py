@@ -304,6 +304,7 @@ test_bad_data_and_questions_are_refused = refused(
         *((lambda _, data=data: View(data), message) for data, message in OTHER),
         (lambda view: view.frame("object", 0), "Unknown pane 'object'"),
         (lambda view: view.frame("object_temperature", 3), "Invalid frame 3"),
+        (lambda view: view.frame("object_temperature", cast(Any, "1")), "Invalid frame '1'"),
         (lambda view: view.curve("object_temperature", NOWHERE), r"Must lie in the image \(4, 5\)"),
         (lambda view: view.curve("object_temperature", BEYOND), r"\(0.0, 6.0\).* image \(4, 5\)"),
         (lambda view: view.curve("status", WHOLE), "Invalid pane 'status'"),

@@ -195,6 +195,10 @@ def test_bad_input_is_named(tmp_path: Path) -> None:
     regions: Any = {"left": (10, 40, 5, 30)}
     with pytest.raises(TypeError, match=r"region 'left', \(10, 40, 5, 30\)\. Must be an explorer"):
         dbthermal.report(scene(), tmp_path / "scene.html", regions=regions)
+    with pytest.raises(TypeError, match=r"Invalid path <xarray\.Dataset>.* Must be text or a path"):
+        dbthermal.report("scene.html", cast(Any, scene()))
+    with pytest.raises(TypeError, match=r"Invalid celsius 'no'\. Must be True"):
+        dbthermal.report(scene(), tmp_path / "scene.html", celsius=cast(Any, "no"))
     with pytest.raises(TypeError, match="regions of type list"):
         dbthermal.report(scene(), tmp_path / "scene.html", regions=cast(Any, [*regions]))
     assert list(tmp_path.iterdir()) == []
