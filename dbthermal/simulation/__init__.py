@@ -154,8 +154,8 @@ def scene(
     height, width = object_temperature.shape[1:]
     values = emissivity.values.reshape(emissivity.shape[0], *emissivity.shape[1:] or (1, 1))
     films = {
-        "object_temperature": object_temperature,
-        "background_temperature": background_temperature,
+        "object_temperature": np.asarray(object_temperature),
+        "background_temperature": np.asarray(background_temperature),
         "emissivity": np.broadcast_to(values, (emissivity.shape[0], height, width)),
     }
     axes = {"band": emissivity["band"].values, "time": ("time", time, {"units": "s"})}
@@ -171,9 +171,9 @@ def side_by_side(emissivity: xr.DataArray, shape: tuple[int, int]) -> xr.DataArr
     emissivity, shape : DataArray, tuple of int
         Emissivity (material, band) [1]; rows and columns of the image.
     """
-    panel = np.arange(shape[1]) * emissivity.sizes["material"] // shape[1]
-    columns = emissivity.values[panel].T[:, np.newaxis, :]
-    image = np.broadcast_to(columns, (emissivity.sizes["band"], *shape))
+    table = emissivity.transpose("band", "material").values
+    panel = np.arange(shape[1]) * table.shape[1] // shape[1]
+    image = np.broadcast_to(table[:, np.newaxis, panel], (len(table), *shape))
     axes = {"band": emissivity["band"].values}
     return xr.DataArray(image, axes, ("band", "y", "x"), attrs={"units": "1"})
 

@@ -214,6 +214,8 @@ def test_same_seed_same_data() -> None:
     xr.testing.assert_identical(record(1), record(1))
     assert float((record(1)["counts"] != record(2)["counts"]).mean()) > 0.9
     scene, detector = simulation.walkers(TIME, SHAPE, GLASS, 1), simulation.pattern(RIG, SHAPE, 1)
+    films: Any = scene["object_temperature"], scene["background_temperature"]  # with their labels
+    xr.testing.assert_identical(simulation.scene(TIME, films[0], films[1], GLASS), scene)
     movies = simulation.blackbody_movies(RIG, np.array([290.0, 300.0]), 2, detector, 1)
     for name, made, *arguments in (  # a seed serves as its generator
         ("walkers", scene, TIME, SHAPE, GLASS),
@@ -256,6 +258,7 @@ test_what_is_refused = refused(
         (SCENE, -PLAIN, PLAIN, GLASS, "Invalid object_temperature [K] -300"),
         (SCENE, PLAIN, np.nan * PLAIN, GLASS, "Invalid background_temperature [K] nan"),
         (SCENE, PLAIN, PLAIN, 100.0 * GLASS, "Invalid emissivity 86"),
+        (simulation.side_by_side, GLASS, SHAPE, "{'material'} do not exist"),
         (disturbances.lose_frames, still(), 1.0, RNG, "Invalid share 1.0"),
         (disturbances.spoil_pixels, still(), 1.0, RNG, "Invalid share 1.0"),
         (disturbances.fire_shutter, still(), 99.0, RNG, "Invalid time 99.0 s of the shutter"),
