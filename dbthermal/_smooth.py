@@ -256,13 +256,16 @@ def polynomial_basis(time: npt.ArrayLike, order: int) -> Array:
 
 def _arnoldi(position: Array, order: int) -> Array:
     """Columns of `polynomial_basis`, where frames in few places make them nearly dependent."""
-    columns = np.full((order, position.size), 1.0 / np.sqrt(position.size))
+    columns = np.full((position.size, order), 1.0 / np.sqrt(position.size))
     for degree in range(1, order):
         # The previous function times the position, made orthogonal (Brubeck, Nakatsukasa,
         # Trefethen 2021, doi:10.1137/19M130839X).
-        columns[degree] = position * columns[degree - 1]
-        _make_orthonormal(columns, degree, 0, position.size)
-    return columns.T
+        following = position * columns[:, degree - 1]
+        for _ in range(2):  # once more, against rounding
+            previous = columns[:, :degree]
+            following = following - previous @ (previous.T @ following)
+        columns[:, degree] = following / np.linalg.norm(following)
+    return columns
 
 
 def bridge(film: npt.NDArray[Any], pixels: Mask) -> npt.NDArray[Any]:

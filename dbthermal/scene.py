@@ -16,7 +16,7 @@ from dbthermal import _arrays, _text, schema, store
 from dbthermal import response as responses
 from dbthermal._arrays import made_on_disk, on_disk
 from dbthermal.alignment import _joint, align, register
-from dbthermal.alignment._planes import Scale, displaced_windows
+from dbthermal.alignment._planes import Scale
 from dbthermal.alignment._resampling import on_one_clock, registered
 from dbthermal.correction import correct_capture
 from dbthermal.separation import separate
@@ -164,16 +164,8 @@ def _aligned(
     scale = Scale.of_response(response, corrected["band"].values.tolist())
     # Stated clocks: the shift alone is estimated.
     if "offset" in options:
-        aligned = on_one_clock(corrected, **options)
-        field = _joint.apart(corrected, scale, **options)
-        if field is not None and displaced_windows(aligned, scale)[0]:
-            return aligned, field
-        return aligned, None
+        return on_one_clock(corrected, **options), _joint.apart(corrected, scale, **options)
     # Clocks and shift from the images.
     comparison = _joint.compare(corrected, scale, **options)
     aligned = on_one_clock(corrected, **{**options, "offset": comparison.offset})
-    if comparison.field is not None and not displaced_windows(aligned, scale)[0]:
-        # Displaced cameras without a shift: their clocks at one place.
-        comparison = _joint.compare(corrected, scale, **options, side_by_side=False)
-        aligned = on_one_clock(corrected, **{**options, "offset": comparison.offset})
     return comparison.noted(aligned), comparison.field

@@ -6,6 +6,7 @@ until neither changes. Without a shift the clocks are those of all pixels.
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Final
@@ -56,12 +57,11 @@ def compare(
     search: int = SEARCH,
     clock: str | None = None,
     lazy: bool = False,
-    side_by_side: bool = True,
 ) -> Comparison:
     """Clocks of the cameras of registered views; the stated ones unless the images contradict.
 
-    The scale of the bands is by default that of their changes. Cameras that are not `side_by_side`
-    stand at one place. ValueError where nothing tells the clocks, as `time_offset`.
+    The scale of the bands is by default that of their changes. ValueError where nothing tells the
+    clocks, as `time_offset`.
     """
     names = [str(name) for name in corrected["band"].values]
     synchronous = xr.DataArray(np.zeros(len(names)), {"band": names}, "band")
@@ -69,10 +69,7 @@ def compare(
         return Comparison(synchronous, 0.0)
     for name in names[1:]:
         check(corrected, name, search)
-    if side_by_side:
-        result = _compared(corrected, scale, synchronous, search=search, clock=clock, lazy=lazy)
-    else:
-        result = _at_one_place(corrected, search)
+    result = _compared(corrected, scale, synchronous, search=search, clock=clock, lazy=lazy)
     if corrected.attrs.get("offset_by") != "caller":
         return result
     frame = clocks.frame_period(clocks.exposure_times(corrected)[0])
@@ -123,19 +120,17 @@ def _compared(
     except ValueError:  # without noise nothing tells a shift
         return _at_one_place(corrected, options["search"])
     # Compare clocks and shift in the reduced picture.
-    offset, field, uncertainty, tried = _clocked(small, scale, synchronous, resample)
+    offset, field, uncertainty = _clocked(small, scale, synchronous, resample)
     full_field = None if field is None else _enlarged(field, corrected)
     if field is None or full_field is None or not seen_apart(full_field):
         return _at_one_place(corrected, options["search"])
     # A false shift may go with a false delay: then one place and its clocks explain more.
-    try:
+    with suppress(ValueError):
         at_one_place = _at_one_place(corrected, options["search"])
         rival = _shift(resample(small, offset=at_one_place.offset), scale)
-    except ValueError:
-        rival = None
-    shift = np.inf if rival is None else np.nanmedian(np.hypot(*rival["shift"].values))
-    if rival is not None and shift < _SAME and all(_explains_more(rival, it) for it in tried):
-        return at_one_place
+        better = rival is not None and rival.attrs["explained"] > field.attrs["explained"]
+        if rival is not None and better and np.nanmedian(np.hypot(*rival["shift"].values)) < _SAME:
+            return at_one_place
     frame = clocks.frame_period(stamps[0])
     if uncertainty <= _PRECISION * frame:
         return Comparison(offset, uncertainty, full_field)
@@ -147,18 +142,10 @@ def _compared(
     return Comparison(offset, uncertainty, full_field, (doubt,))
 
 
-def _explains_more(rival: xr.Dataset, field: xr.Dataset) -> bool:
-    """A rival shift explains more of the second camera's energy, in the pixels of both."""
-    common = rival["known"].values & field["known"].values
-    sums = (shift["energy"].values[:, common].sum(axis=1) for shift in (rival, field))
-    shares = [explained / max(energy, 1e-9) for explained, energy in sums]
-    return bool(shares[0] > shares[1])
-
-
 def _clocked(
     small: xr.Dataset, scale: Scale, synchronous: xr.DataArray, resample: Callable[..., xr.Dataset]
-) -> tuple[xr.DataArray, xr.Dataset | None, float, list[xr.Dataset]]:
-    """Offsets of the clocks, shift of the reflections, uncertainty [s], shifts of all trials."""
+) -> tuple[xr.DataArray, xr.Dataset | None, float]:
+    """Offsets of the clocks, shift of the reflections, uncertainty [s]."""
     names, trials = small["band"].values, list[_Trial]()
 
     def compare_at(**clock: Any) -> tuple[xr.DataArray, xr.Dataset | None]:
@@ -170,7 +157,7 @@ def _clocked(
 
     _, field = compare_at(offset=synchronous)
     if field is None:
-        return synchronous, None, np.nan, []
+        return synchronous, None, np.nan
     synchronous_trials, frame = trials.copy(), clocks.frame_period(clocks.exposure_times(small)[0])
     trials.clear()
     try:
@@ -184,11 +171,11 @@ def _clocked(
             break
         offset, field = compare_at(offset=trial)
     if not trials:
-        return offset, field, np.nan, [] if field is None else [field]
+        return offset, field, np.nan
     best, step = _step(trials, frame)
     # The uncertainty is at least the standard deviation of the delay.
     uncertainty = float(np.hypot(step, best.field.attrs["delay_std"]))
-    return best.offset, best.field, uncertainty, [trial.field for trial in trials]
+    return best.offset, best.field, uncertainty
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,9 +12,9 @@ from typing import Final
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from dbthermal import _smooth as smooth
 from dbthermal._arrays import Array, Mask
 from dbthermal.alignment import _splines as images
+from dbthermal.alignment._planes import EVENT
 from dbthermal.alignment._splines import Field, Information, Movie, Spline
 from dbthermal.noise import MAD
 
@@ -27,18 +27,24 @@ _MIRRORED: Final = 1.0
 # White noise of values, and of slopes over a pixel, after the blur over that before.
 _VALUE_NOISE: Final = 1.0 / (2.0 * np.sqrt(np.pi) * BLUR)
 _SLOPE_NOISE: Final = _VALUE_NOISE * np.sqrt(2.0 * (1.0 - np.exp(-0.25 / BLUR**2)))
-_PLANES: Final = 32  # functions of time by which whole pixels are matched
 _ROUNDS, _ROBUST = 12, 4  # rounds of a field, and of robust weights of whole-pixel matches
 _CONVERGED: Final = 2e-3  # mean change of the field at its end, of coarser pixels larger [pixel]
 # Explained energy, in variances of noise, that chance does not reach at one of many shifts.
 _SIGNIFICANT: Final = 40.0
-_USUAL: Final = 0.95  # share of a pixel's samples that are no rare change
 _ROUGH: Final = 0.5  # assumed deviation of a whole-pixel match [pixel]
 # Parts along a side of the image, for a delay's jackknife; pixels that give a movie's noise.
 _PARTS, _NOISE_PIXELS = 6, 256
 # Share of the changes from which one function of time holds all: before lamps 0.99 to 1, before
 # people, hands and fans 0.1 to 0.5, of switched spots up to 0.97.
 _LEADING: Final = 0.98
+# Power of the misfit by which the weight of an event falls; rounds of weights before the first
+# step; weight of whole-pixel matches without a shift, as of an object. Of touches before switched
+# spots 8 fields are .14 pixel off without these (median), .024 with, .055 with the power 2 and one
+# round; with the weight 1 four of the 8 starts are 1 to 2.5 pixels off.
+_EXCLUDED, _WEIGHTED, _UNMOVED = 3, 2, 0.05
+# Share of what is reflected that a field may leave in its last rounds: with 0 an object beside a
+# still half is .053 K off, with .03 .039; with .1 touches bend five of six fields by .6 to 2 pixel.
+_MODEL: Final = 0.03
 _RIDGE: Final = 1e-4  # of the largest information on a shift, added for windows without any
 
 
@@ -50,39 +56,34 @@ class Movies:
     targets: list[Movie]
     valid: Mask  # pixels (y, x) with data in all
     noise: Array  # standard deviation of a sample before the blur, first and targets [K]
-    freedom: float  # degrees of freedom of a pixel's noise
-    outside: float  # degrees of freedom of what a model leaves over these [1]
+    freedom: Movie  # degrees of freedom of a pixel's noise, of each event
+    outside: Movie  # degrees of freedom of what a model leaves over these [1]
     lamp: bool  # one function of time holds nearly all changes
     factor: int  # pixels of the capture along a side of a pixel here
 
     @classmethod
     def blurred(
-        cls,
-        movies: list[Movie],
-        valid: Mask,
-        noise: Array,
-        freedom: float,
-        factor: int,
-        whole: float,
+        cls, movies: list[Movie], valid: Mask, noise: Array, power: Array, factor: int, whole: float
     ) -> "Movies":
-        """Movies of pixels that are so many times coarser than the mask's."""
+        """Movies of coarser pixels; power of white noise in each function of time, and in all."""
         mostly = images.binned(valid.astype(np.float64), factor) > 0.5
         step = max(1, np.count_nonzero(mostly) // _NOISE_PIXELS)
         sample = tuple(index[::step] for index in np.nonzero(mostly))
         if sample[0].size:
             # Interpolated in time, a movie holds less rapid noise than white noise of its size.
-            white = np.sqrt(freedom / movies[0].shape[2]) / factor
+            white = np.sqrt(power.mean()) / factor
             usual = [MAD * np.median(np.abs(movie[sample])) for movie in movies]
             noise = np.minimum(noise, np.array(usual) / white)
         first = images.splines(movies[0], BLUR)
         targets = [images.blurred(movie, BLUR) for movie in movies[1:]]
         # What a model leaves lies all over the frames; but where one function of time holds the
         # changes, as of a lamp, in this one, and a border of materials bends the field.
-        energy = np.sum(np.square(first, dtype=np.float64), axis=(0, 1))
+        energy = np.linalg.eigvalsh(np.tensordot(first, first, ((0, 1), (0, 1))))
         energy -= first[..., 0].size * (noise[0] / factor * _VALUE_NOISE) ** 2
         lamp = bool(energy.max() > _LEADING * np.maximum(energy, 0.0).sum())
-        outside = 1.0 / freedom if lamp else max(whole / freedom, 1.0)
-        return cls(first, targets, mostly, noise / factor, freedom, outside, lamp, factor)
+        events = power.reshape(-1, max(1, power.size // EVENT)).sum(axis=0).astype(np.float32)
+        outside = 1.0 / events if lamp else np.full_like(events, max(whole / power.sum(), 1.0))
+        return cls(first, targets, mostly, noise / factor, events, outside, lamp, factor)
 
     def centres(self) -> list[Array]:
         """Rows and columns, of the capture, of the pixels' centres."""
@@ -116,11 +117,16 @@ def _whole_pixels(
             gain += np.maximum(images.blurred(cross, WINDOW), 0.0) ** 2
         shifted = [energies[0][rows, right : right + width] for right in range(gain.shape[2])]
         gain /= np.maximum(images.blurred(np.stack(shifted, axis=-1), WINDOW), freedom)
+        if down == reach[0]:
+            still = gain[..., reach[1]]
         right, highest = gain.argmax(axis=2), gain.max(axis=2)
         better = highest > best
         best[better], where[0][better], where[1][better] = highest[better], down, right[better]
     # Products of two blurred noises are alike over an area of 2 pi BLUR^2.
     chance = _SIGNIFICANT * 2.0 * np.pi * BLUR**2 / (4.0 * np.pi * WINDOW**2)
+    unmoved = best - still <= chance
+    where[:, unmoved] = np.reshape(reach, (2, 1))
+    best = np.where(unmoved, _UNMOVED * still, best - still)
     # Weight: share of the movies' energy in a window that is explained.
     share = best / np.maximum(gaussian_filter(sum(energies[1:]), WINDOW), 1e-9)
     return where - np.reshape(reach, (2, 1, 1)), np.where(best > chance, share, 0.0)
@@ -134,7 +140,9 @@ def on_valid(places: Array, valid: Mask) -> Mask:
     return np.asarray(result & valid[row, column])
 
 
-def _information(movies: Movies, shift: Array) -> Information:
+def _information(
+    movies: Movies, shift: Array, misfits: Movie, tolerance: float
+) -> tuple[Information, Movie]:
     r"""Information on a step of the field at each pixel, by Gauss-Newton.
 
     With the moved movie m, its slopes g and a ratio k of a window, the residual of a pixel is
@@ -148,21 +156,25 @@ def _information(movies: Movies, shift: Array) -> Information:
               A = k^2 \left[\sum g g^T - q \sum g m \sum m g^T\right], \quad
               b = k \left[\sum g r - q \sum g m \sum m r\right] - A \sigma^2 \nabla (k + u) / k
 
-    over s^2, less what noise makes of the slopes; s^2 is the noise's variance where the residual is
-    noise, and larger where it is not. Sums are over time.
+    over s^2, the noise's variance, less what noise makes of the slopes. Sums are over time, events
+    of a misfit weighed less. Second, the misfit of the residual (movie, y, x, event), over noise
+    and a tolerated share of what is reflected.
     """
     places, used = movies.pairs(shift)
     noise = movies.noise[0] * _VALUE_NOISE
     total = np.zeros((*used.shape, 6))
     window = partial(gaussian_filter, sigma=WINDOW)
-    number = np.maximum(window(used * movies.freedom), 1e-9)
-    moments = images.products(movies.first, movies.targets, places) * used[..., np.newaxis]
-    for sums, level in zip(moments, movies.noise[1:], strict=True):
-        mm, my, mx, mh, yy, yx, yh, xx, xh, hh = np.moveaxis(sums, 2, 0)
-        auto, terms = np.moveaxis(images.blurred(sums[..., [0, 3]], WINDOW), 2, 0)
+    numbers = np.maximum(window(used * np.float32(1.0)), 1e-9)[..., np.newaxis] * movies.freedom
+    weights = np.where(used[..., np.newaxis], misfits**-_EXCLUDED, np.float32(0.0))
+    moments, events = images.products(movies.first, movies.targets, places, weights)
+    updated = np.empty_like(misfits)
+    for place, level in enumerate(movies.noise[1:]):
+        mm, my, mx, mh, yy, yx, yh, xx, xh = np.moveaxis(moments[place, ..., :9], 2, 0)
+        freedom = weights[place] @ movies.freedom
+        auto, terms, number = window(mm), window(mh), window(freedom)
         # Noise of the moved movie makes its energy larger, not its product with another movie.
         auto -= number * noise**2
-        ratio = terms / np.maximum(auto, 0.1 * number * noise**2)
+        ratio = terms / np.maximum(auto, 0.1 * np.maximum(number, 1e-9) * noise**2)
         # Summed over pixels, the noise is that before the blur.
         variance = level**2 + (ratio * movies.noise[0]) ** 2
         white, along = variance * _VALUE_NOISE**2, mh - ratio * mm
@@ -171,10 +183,19 @@ def _information(movies: Movies, shift: Array) -> Information:
         uneven = free * np.maximum(window(along**2) - white * window(mm), 0.0)
         uneven /= np.maximum(window(mm**2), np.finfo(np.float64).tiny)
         share = uneven / (white + uneven * mm)
-        residual = window(hh - 2.0 * ratio * mh + ratio**2 * mm - share * along**2)
-        excess = residual / white - number
-        misfit = np.maximum(1.0 + excess / (number * movies.outside), 1.0)
-        weight = used * ratio / (misfit * variance)
+        each, square, scale = np.array([ratio + share * along, ratio**2, white], "f4")[..., None]
+        squares, crosses, last = np.moveaxis(events[place], 2, 0)
+        excess, reflected = (
+            images.blurred(used[..., np.newaxis] * energy, WINDOW) / scale - numbers
+            for energy in (last - 2.0 * each * crosses + each**2 * squares, square * squares)
+        )
+        # What the object does at the same time is in the residual of few events.
+        outside = numbers * movies.outside
+        expected = outside + tolerance * np.maximum(reflected, 0.0)
+        updated[place] = np.maximum((outside + excess) / expected, 1.0)
+        # What is tolerated of the events that count makes the window count less.
+        unexplained, chance = (np.sum(weights[place] * it, axis=2) for it in (excess, outside))
+        usual = np.maximum(1.0 + unexplained / np.maximum(chance, 1e-9), 1.0) if tolerance else 1.0
         yy, yx, xx = yy - share * my**2, yx - share * my * mx, xx - share * mx**2
         # By as much as the blur moves what it sees of an uneven ratio, the shift is not off.
         moved = free * BLUR**2 * np.stack(np.gradient(ratio + share * along))
@@ -182,16 +203,17 @@ def _information(movies: Movies, shift: Array) -> Information:
             yh - ratio * my - share * my * along - yy * moved[0] - yx * moved[1],
             xh - ratio * mx - share * mx * along - yx * moved[0] - xx * moved[1],
         )
-        less = ratio * movies.freedom * (movies.noise[0] * _SLOPE_NOISE) ** 2
+        less = ratio * freedom * (movies.noise[0] * _SLOPE_NOISE) ** 2
         squares = ratio * yy - less, ratio * yx, ratio * xx - less
-        total += weight[..., np.newaxis] * np.stack([*squares, *steps, less], axis=-1)
+        weight = (used * ratio / (usual * variance))[..., np.newaxis]
+        total += weight * np.stack([*squares, *steps, less], axis=-1)
     total = np.moveaxis(images.blurred(total, WINDOW), 2, 0)
     tensor, gradient, less = total[:3], total[3:5], total[5]
     # With noise N in the slopes, var = (A + N) / A^2: as if the information were A^2 / (A + N).
     size = tensor[0] + tensor[2]
     share = np.maximum(size, 0.0) / np.maximum(size + less, 1e-300)
     tensor, gradient = _positive(tensor) * share, gradient * share
-    return Information(tensor / movies.factor**2, gradient / movies.factor)
+    return Information(tensor / movies.factor**2, gradient / movies.factor), updated
 
 
 def eigenvalues(tensor: Array) -> tuple[Array, Array]:
@@ -209,20 +231,12 @@ def _positive(tensor: Array) -> Array:
     return np.where(low < 0.0, share * (tensor - low * unit), tensor)
 
 
-def start(movies: Movies, films: list[Movie], freedom: float, spline: Spline) -> Field | None:
-    """Field of whole-pixel matches of films, wrong ones taken for outliers; None without any."""
+def start(movies: Movies, planes: list[Movie], spline: Spline) -> Field | None:
+    """Field of whole-pixel matches of planes, wrong ones taken for outliers; None without any."""
     reach = movies.valid.shape[0] // 3, movies.valid.shape[1] // 3
-    pictures = []
-    for film, level in zip(films, movies.noise, strict=True):
-        # Rare large changes are cut: they are an object's, if it changes rapidly.
-        picture = images.blurred(film, BLUR)
-        usual = np.quantile(np.abs(picture), _USUAL, axis=-1, keepdims=True)
-        picture /= np.sqrt(1.0 + (picture / np.maximum(usual, 1e-12)) ** 2) * level * _VALUE_NOISE
-        pictures.append(picture)
-    functions = smooth.leading(pictures[0].reshape(-1, pictures[0].shape[2]), _PLANES)
-    pictures = [np.asarray(picture @ functions, np.float32) for picture in pictures]
-    freedom *= functions.shape[1] / functions.shape[0]
-    rough, share = _whole_pixels(pictures[0], pictures[1:], freedom, reach)
+    levels = np.float32(movies.noise * _VALUE_NOISE)
+    pictures = [images.blurred(it, BLUR) / level for it, level in zip(planes, levels, strict=True)]
+    rough, share = _whole_pixels(pictures[0], pictures[1:], float(movies.freedom.sum()), reach)
     share *= movies.valid
     if not share.any():
         return None
@@ -244,26 +258,39 @@ def start(movies: Movies, films: list[Movie], freedom: float, spline: Spline) ->
     return field
 
 
-def refine(movies: Movies, field: Field) -> tuple[Field, Information]:
+def refine(movies: Movies, field: Field, *, rough: bool) -> tuple[Field, Information]:
     """Field after Gauss-Newton, and the information of each pixel on it."""
     field = replace(field, settled=False)
-    for _ in range(_ROUNDS):
-        shift = field.on(movies.centres())
-        data = _information(movies, shift)
-        field = field.spline.fitted(data, movies.centres(), field)
-        change = np.abs(field.on(movies.centres()) - shift)
-        if change.mean() < _CONVERGED * movies.factor**2:
-            break
+    misfits = misfits_of(movies, field.on(movies.centres()))
+    # A rough field first follows the events that it explains, alone.
+    for tolerance in (0.0, _MODEL) if rough else (_MODEL,):
+        for number in range(_ROUNDS):
+            shift = field.on(movies.centres())
+            data, misfits = _information(movies, shift, misfits, tolerance)
+            field = field.spline.fitted(data, movies.centres(), field)
+            change = np.abs(field.on(movies.centres()) - shift)
+            # The weights of the first round are those before it.
+            if number > 0 and change.mean() < _CONVERGED * movies.factor**2:
+                break
     return field, data
 
 
-def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Array]:
+def misfits_of(movies: Movies, shift: Array) -> Movie:
+    """Misfit (movie, y, x, event) over noise of what a shift (2, y, x) [pixel] explains."""
+    result = np.ones((len(movies.targets), *movies.valid.shape, movies.freedom.size), np.float32)
+    for _ in range(_WEIGHTED):
+        _, result = _information(movies, shift, result, 0.0)
+    return result
+
+
+def delay(movies: Movies, rate: Movie, shift: Array, misfits: Movie) -> tuple[float, float, Array]:
     r"""Time by which the others show what the first movie shows at a shift, and its deviation [s].
 
-    The shift is (2, y, x) [pixel], the rate a matrix that takes planes to their change [1/s].
-    Motion in one direction looks like a shift or a delay: a Newton step solves for both, the shift
-    free in each window. With the slopes g of the moved movie :math:`h`, its change :math:`\dot h`,
-    the residual r of the others over their ratio to h, and sums over time and a window,
+    The shift is (2, y, x) [pixel], the rate a matrix that takes planes to their change [1/s], the
+    misfits are the variances of events. Motion in one direction looks like a shift or a delay: a
+    Newton step solves for both, the shift free in each window. With the slopes g of the moved movie
+    :math:`h`, its change :math:`\dot h`, the residual r of the others over their ratio to h, and
+    sums over time and a window,
 
     .. math:: \delta = \sum (\dot h r - c^T A^{-1} \, g r) / \sum (\dot h^2 - c^T A^{-1} c),
               \quad A = g g^T, \; c = g \dot h
@@ -272,13 +299,15 @@ def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Arra
     beside noise, in variances of noise.
     """
     places, used = movies.pairs(shift)
-    sums = images.products(movies.first, movies.targets, places, rate) * used[..., np.newaxis]
-    # Noise of the slopes and of the moved movie.
-    number = gaussian_filter(used * movies.freedom, WINDOW)[..., np.newaxis] * movies.noise[0] ** 2
-    less = number * np.square([_VALUE_NOISE, _SLOPE_NOISE, _SLOPE_NOISE, 0.0])
+    weights = np.where(used[..., np.newaxis], 1.0 / misfits, np.float32(0.0))
+    moments, _ = images.products(movies.first, movies.targets, places, weights, rate)
     totals = np.zeros((4, *movies.valid.shape))
-    for array, level in zip(sums, movies.noise[1:], strict=True):
+    for array, each, level in zip(moments, weights, movies.noise[1:], strict=True):
         windows = images.blurred(array, WINDOW)
+        freedom = gaussian_filter(each @ movies.freedom, WINDOW)
+        # Noise of the slopes and of the moved movie.
+        less = freedom[..., np.newaxis] * movies.noise[0] ** 2
+        less = less * np.square([_VALUE_NOISE, _SLOPE_NOISE, _SLOPE_NOISE, 0.0])
         equations = images.normal_equations(windows, less)
         # The shift of each window is eliminated.
         tensor, cross = equations[..., :2, :2], equations[..., :2, 2]
@@ -287,7 +316,7 @@ def delay(movies: Movies, rate: Movie, shift: Array) -> tuple[float, float, Arra
         late = equations[..., 3, 2] - np.sum(share * equations[..., 3, :2], axis=-1)
         seen = equations[..., 2, 2] - np.sum(share * cross, axis=-1)
         moved, common, second = (windows[..., place] for place in (0, 4, 14))
-        second = second - movies.freedom * (level * _VALUE_NOISE) ** 2
+        second = second - freedom * (level * _VALUE_NOISE) ** 2
         alike = np.maximum(common, 0.0) ** 2 / np.maximum(moved, np.finfo(np.float64).tiny)
         totals += np.where(used, np.stack([late, seen, alike, second]), 0.0) / level**2
     gradient, information, *energy = totals

@@ -33,6 +33,7 @@ _PIXELS: Final = 1024  # pixels, about, by which valid frames are chosen
 # with 128, of 36 fields 1.2 and 1.4 times as much with 32 and with whole films); and pixels that
 # tell each of them.
 _PLANES, _FOR_EACH = 96, 8
+EVENT: Final = 4  # functions of time of an event, that a field weighs alike
 # Of displaced windows: frames, number along either side of the image, and their sides [pixel].
 _FRAMES, _ALONG, _SIDES = 400, 8, (8, 16)
 _BLUR: Final = 2.0  # before a displacement is looked for [pixel]
@@ -133,27 +134,31 @@ class Capture:
         return np.stack([np.pad(penalty.diagonal(lag), (lag, 0)) for lag in (3, 2, 1, 0)])
 
     def functions(self, signals: Movie, period: float) -> Movie:
-        """Functions (time, plane) of the changes within a period [frame] that signals show most."""
+        """Functions (time, plane), each of a moment, of most changes within a period [frame]."""
         smoothing = self.smoothing(period)
         sample = signals.reshape(-1, signals.shape[-1])
         sample = sample[:: max(1, len(sample) // (_FOR_EACH * _PLANES))]
-        functions = rapid(smooth.leading(rapid(sample, smoothing), _PLANES).T, smoothing).T
+        leading = smooth.leading(rapid(sample, smoothing), _PLANES)
+        leading = leading[:, : max(1, leading.shape[1] // EVENT) * EVENT]
+        # Eigenvectors of time within their span are the most local functions, in order. Events, of
+        # some in a row, take turns: the first function of each, then the second.
+        _, turn = np.linalg.eigh(leading.T @ (np.arange(len(leading))[:, np.newaxis] * leading))
+        events = max(1, turn.shape[1] // EVENT)
+        turn = turn.reshape(-1, events, turn.shape[1] // events).swapaxes(1, 2).reshape(turn.shape)
+        functions = rapid((leading @ turn).T, smoothing).T
         return np.ascontiguousarray(functions, np.float32)
 
-    def planes(self, functions: list[Movie]) -> list[list[Movie]]:
-        """Parts (y, x, plane) [K] of the bands along each of some functions of time."""
-        together = np.concatenate(functions, axis=1)
-        result = np.empty((self.bands.size, *self.valid.shape, together.shape[1]), np.float32)
+    def planes(self, functions: Movie) -> list[Movie]:
+        """Parts (y, x, plane) [K] of the bands along some functions of time (time, plane)."""
+        result = np.empty((self.bands.size, *self.valid.shape, functions.shape[1]), np.float32)
         for rows, films, _ in self.blocks(_ROWS):
             for movie, film, slope in zip(result, films, self.slopes, strict=True):
-                planes = film.reshape(len(film), -1).T @ (together / np.float32(slope))
+                planes = film.reshape(len(film), -1).T @ (functions / np.float32(slope))
                 movie[rows] = planes.reshape(movie[rows].shape)
         if not self.valid.all():
-            lost = ~self.valid
-            nearest = distance_transform_edt(lost, return_distances=False, return_indices=True)
-            result[:, lost] = result[:, *nearest[:, lost]]
-        ends = np.cumsum([array.shape[1] for array in functions])
-        return [list(array) for array in np.split(result, ends[:-1], axis=3)]
+            nearest = distance_transform_edt(~self.valid, return_indices=True)[1]
+            result[:, ~self.valid] = result[:, *nearest[:, ~self.valid]]
+        return list(result)
 
     def binned(self, factor: int) -> tuple[list[Movie], Mask]:
         """Signals (y, x, time) [K] of squares of pixels, and the pixels that lack few frames."""
@@ -301,7 +306,8 @@ def _window_equations(corrected: xr.Dataset, scale: Scale) -> Iterator[tuple[Arr
         for block, function, rate in zip(sums, functions, rates, strict=True):
             planes = np.tensordot(film, function.astype(np.float32), (1, 0))
             first, second = images.splines(planes[0], _BLUR), images.blurred(planes[1], _BLUR)
-            pairs = images.products(first, [second], places, rate.astype(np.float32))[0].sum(axis=0)
+            even, steps = np.ones((1, *places.shape[1:], 1), np.float32), rate.astype(np.float32)
+            pairs = images.products(first, [second], places, even, steps)[0][0].sum(axis=0)
             within = (slice(start, start + side) for start in lefts - columns.start)
             block.extend(pairs[window].sum(axis=0) for window in within)
     # Noise of variance s^2, blurred by b: s^2 / (4 pi b^2), of a slope 1 / (2 b^2) of that.

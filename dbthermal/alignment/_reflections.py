@@ -17,16 +17,10 @@ from dbthermal.alignment._planes import Capture, Scale
 from dbthermal.alignment._splines import Field, Information, Movie, Spline, binned
 
 _COARSE: Final = 28  # pixels along the shorter side of the coarsest image, at least
-_FEW: Final = 64  # functions of time on the coarsest image
-_START: Final = 20  # pixels along the shorter side for whole-pixel matches, at least
-# Periods [frame] of which slower changes are left out: the shorter, the less an object that heats
-# rapidly enters. A longer one is taken whose field has so many times smaller deviations where the
-# shorter one is known, and a chi-square by the shorter one's data below so much: of people before
-# glass, a wineglass and a coffee pot it was .1 to 3.0, and 6 to 3000 where an object's own changes
-# entered.
+# Periods [frame] of which slower changes are left out. A longer one is taken whose field has so
+# many times smaller deviations where the shorter one is known.
 _PERIODS: Final = (5.0, 10.0, 20.0, 80.0)
-_SLOW: Final = 20.0  # shortest period of which a delay is estimated [frame]
-_MORE, _AGREE = 1.25, 4.5
+_MORE: Final = 1.25
 _KNOWN: Final = 0.2  # largest deviation of a shift by the data of a window alone [pixel]
 _WIDE: Final = 6.0  # deviation of the window in which a field and its data are compared [pixel]
 _RIDGE: Final = 1e-6  # of the largest information, added for windows without any
@@ -71,54 +65,49 @@ def reflection_shift(corrected: xr.Dataset, response: xr.Dataset) -> xr.Dataset:
         the right, `shift_std`, and `known` (y, x), where texture tells the shift. It is
         extrapolated near by, and NaN farther off and where p + d(p) leaves the image. Attributes:
         `reference_band`, `bands` (the others); `delay` [s] of these, beside the shift, and
-        `delay_std` [s].
+        `delay_std` [s]; `explained`, the share of their changes' energy [1].
     """
     names = [str(name) for name in schema.check_corrected(corrected)["counts"]["band"].values]
-    return shift_of(corrected, Scale.of_response(response, names)).drop_vars("energy")
+    return shift_of(corrected, Scale.of_response(response, names))
 
 
 @without_blas_threads  # on any number of cores the same field
 def shift_of(corrected: xr.Dataset, scale: Scale) -> xr.Dataset:
-    """Displacement as `reflection_shift`, from coarse to fine, and its `energy`, see `delay`."""
+    """Displacement as `reflection_shift`, from coarse to fine."""
     capture = Capture.of(corrected, scale)
     shape = capture.valid.shape
     spline = Spline((shape[0], shape[1]), max(shape) / 3.0)
     factor = 2 ** max(0, int(np.log2(min(shape) / _COARSE)))
-    capture, tried, period, field = _coarse(capture, spline, factor)
-    # Planes of both periods in one reading of the films: slower changes show more of a delay.
-    slow = min((longer for longer in tried if longer >= max(period, _SLOW)), default=max(tried))
-    functions = [tried[length] for length in sorted({period, slow})]
-    movies, white = capture.planes(functions), planes.white(capture.frames.size, period)
+    capture, functions, white, field = _coarse(capture, spline, factor)
+    movies, power = capture.planes(functions), np.sum(functions**2, axis=0)
 
-    def level(place: int, factor: int) -> Movies:
-        """Movies of the changes within one of the periods, of coarser pixels."""
-        pictures = [binned(movie, factor) for movie in movies[place]]
-        freedom = float(np.sum(functions[place] ** 2))  # of white noise
-        return Movies.blurred(pictures, capture.valid, capture.noise, freedom, factor, white)
+    def level(factor: int) -> Movies:
+        """Movies of coarser pixels."""
+        pictures = [binned(movie, factor) for movie in movies]
+        return Movies.blurred(pictures, capture.valid, capture.noise, power, factor, white)
 
     # From coarser pixels to those of the capture.
     while factor > 2:
         factor //= 2
-        field, _ = matching.refine(level(0, factor), field)
-    fine = level(0, 1)
-    field, data = matching.refine(fine, field)
+        field, _ = matching.refine(level(factor), field, rough=False)
+    fine = level(1)
+    field, data = matching.refine(fine, field, rough=False)
     spread = _variances(field, fine, data)
     # Matrix that takes planes to those of their rate of change, by least squares.
     times = corrected["time"].values[capture.frames]
-    change = np.asarray(np.gradient(np.eye(times.size), times, axis=0)).T @ functions[-1]
-    rate = np.linalg.lstsq(functions[-1], change)[0].astype(np.float32)
-    slower = fine if len(movies) == 1 else level(-1, 1)
+    change = np.asarray(np.gradient(np.eye(times.size), times, axis=0)).T @ functions
+    rate = np.linalg.lstsq(functions, change)[0].astype(np.float32)
     place = field.on(fine.centres())
-    late, std, energy = matching.delay(slower, rate, place)
+    misfits = matching.misfits_of(fine, place)
+    late, std, energy = matching.delay(fine, rate, place, misfits)
     # A shift that explains little of what no shift leaves is not that of the reflections.
-    still = matching.delay(slower, rate, np.zeros_like(place))[2]
+    still = matching.delay(fine, rate, np.zeros_like(place), misfits)[2]
     sums = np.sum([energy, still], axis=(2, 3), where=energy[1] * still[1] != 0.0)
     moved, unmoved = 1.0 - quotient(sums[:, 0], sums[:, 1], 1.0)
     if not unmoved - max(moved, 0.0) > max(_EXPLAINED * unmoved, _LEAST_GAIN):
         spread = np.maximum(spread, place**2)
     result = _result(corrected, capture, field, data, spread)
-    delayed = result.assign_attrs(delay=late, delay_std=std)
-    return delayed.assign(energy=(("part", "y", "x"), energy))
+    return result.assign_attrs(delay=late, delay_std=std, explained=1.0 - float(moved))
 
 
 def seen_apart(field: xr.Dataset) -> bool:
@@ -127,50 +116,34 @@ def seen_apart(field: xr.Dataset) -> bool:
     return bool(np.any(sizes["shift"] > np.maximum(_SIGMAS * sizes["shift_std"], _LEAST_SHIFT)))
 
 
-def _coarse(
-    capture: Capture, spline: Spline, factor: int
-) -> tuple[Capture, dict[float, Movie], float, Field]:
-    """Capture with its valid pixels, functions of all periods, the best period, rough field."""
+def _coarse(capture: Capture, spline: Spline, factor: int) -> tuple[Capture, Movie, float, Field]:
+    """Capture with its valid pixels, functions of the best period, noise in them, rough field."""
     signals, valid = capture.binned(factor)
-    frames, tried, result = capture.frames.size, dict[float, Movie](), None
-    refusal: ValueError | None = None
-    # Of the field that was taken: its data, the pixels that they resolve, and its deviations.
-    before, earlier, sizes = None, np.zeros((1, 1), bool), np.zeros((1, 1))
+    frames, refusal, result = capture.frames.size, None, None
+    # Of the field that was taken: the pixels that its data resolve, and its deviations.
+    earlier, sizes = np.zeros((1, 1), bool), np.zeros((1, 1))
     for period in _PERIODS:
         if frames < 2 * period and result is not None:
             break
-        tried[period] = capture.functions(signals[0], period)
-        functions = tried[period][:, :_FEW]
-        white, freedom = planes.white(frames, period), float(np.sum(functions**2))
+        functions = capture.functions(signals[0], period)
+        white, power = planes.white(frames, period), np.sum(functions**2, axis=0)
         pictures = [signal @ functions for signal in signals]
-        level = Movies.blurred(pictures, valid, capture.noise, freedom, factor, white)
+        level = Movies.blurred(pictures, valid, capture.noise, power, factor, white)
         begin = None if result is None else result[-1]
         if begin is None:
-            # Whole frames, of which what is rare in a pixel's time is cut.
-            half = 2 if min(level.valid.shape) >= 2 * _START else 1
-            mostly = binned(level.valid * 1.0, half) > 0.5
-            rough = replace(level, valid=mostly, noise=level.noise / half, factor=factor * half)
-            smoothing = capture.smoothing(period)
-            films = [planes.rapid(binned(signal, half), smoothing) for signal in signals]
             try:
-                begin = matching.start(rough, films, white, spline)
+                begin = matching.start(level, pictures, spline)
             except ValueError as error:  # slower changes may tell more
                 refusal = error
         if begin is None:
             continue
-        field, data = matching.refine(level, begin)
+        field, data = matching.refine(level, begin, rough=True)
         resolved = _resolved(data, factor)
         size = 0.25 * np.log(_variances(field, level, data)).sum(axis=0)
-        gain, distance = np.inf, 0.0
-        if before is not None:
-            gain = np.mean((sizes - size)[earlier])
-            # A field of slower changes must fit the data of the more robust field before it, unless
-            # that field's deviation is a pixel or more: an unknown field vetoes no shift.
-            distance = begin.disagreement(before, level.centres(), field)
-            distance = distance if np.mean(sizes[earlier]) < 0.0 else 0.0
-        if resolved.any() and gain > np.log(_MORE) and distance < _AGREE:
-            before, earlier, sizes = data, resolved, size
-            result = (replace(capture, valid=valid), tried, period, field)
+        gain = np.inf if result is None else np.mean((sizes - size)[earlier])
+        if resolved.any() and gain > np.log(_MORE):
+            earlier, sizes = resolved, size
+            result = (replace(capture, valid=valid), functions, white, field)
     if result is None:
         raise refusal or ValueError(
             "Missing texture in the reflections: no rapid change that the bands share. "

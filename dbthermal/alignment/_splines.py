@@ -64,25 +64,34 @@ def splines(movie: Movie, width: float) -> Movie:
     return np.pad(smooth, ((_EDGE, _EDGE), (_EDGE, _EDGE), (0, 0)), mode="symmetric")
 
 
-def products(movie: Movie, movies: list[Movie], places: Array, rate: Movie | None = None) -> Array:
+def products(
+    movie: Movie, movies: list[Movie], places: Array, weights: Movie, rate: Movie | None = None
+) -> tuple[Array, Movie]:
     """Sums over planes (movie, y, x, pair) of the products of signals at places (2, y, x).
 
     Signals are the moved movie, of `splines`, its slopes down and right, and another movie, each
     with itself and all that follow: 10 pairs. With a matrix (plane, plane) of the rate of change
-    the rate follows the slopes: 15 pairs.
+    the rate follows the slopes: 15 pairs. Events with weights (movie, y, x, event) take turns along
+    the planes. Second, of each event the pairs (movie, y, x, 3, event) of the two movies.
     """
-    shape, planes = places.shape[1:], movie.shape[2]
-    count = 4 if rate is None else 5
-    result = np.zeros((len(movies), *shape, count * (count + 1) // 2))
-    for start in range(0, shape[0], _ROWS):
-        rows = slice(start, min(start + _ROWS, shape[0]))
+    (height, width), count = places.shape[1:], 4 if rate is None else 5
+    result = np.empty((len(movies), height, width, count * (count + 1) // 2))
+    number = weights.shape[3]
+    events = np.empty((len(movies), height, width, 3, number), np.float32)
+    sums = np.empty((_ROWS * width, result.shape[3], number), np.float32)
+    for start in range(0, height, _ROWS):
+        rows = slice(start, min(start + _ROWS, height))
         signals = sampled(movie, places[:, rows].reshape(2, -1) + _EDGE)
         if rate is not None:
             signals = np.concatenate([signals, (signals[0] @ rate)[np.newaxis]])
-        for second, out in zip(movies, result, strict=True):
-            sums = out[rows].reshape(-1, out.shape[2])
-            _sum_pairs(signals, second[rows].reshape(-1, planes), sums)
-    return result
+        size = signals.shape[1]
+        signals, used = signals.reshape(count - 1, size, -1, number), sums[:size]
+        for place, second in enumerate(movies):
+            _sum_pairs(signals, second[rows].reshape(signals.shape[1:]), used)
+            pairs = used.reshape(-1, width, *used.shape[1:])
+            result[place, rows] = (pairs @ weights[place, rows, :, :, np.newaxis])[..., 0]
+            events[place, rows] = pairs[:, :, [0, count - 1, -1]]
+    return result, events
 
 
 def normal_equations(sums: Array, noise: Array) -> Array:
@@ -164,18 +173,19 @@ def _cubic(away: float) -> float:
 
 
 @compiled
-def _sum_pairs(signals: Movie, last: Movie, out: Array) -> None:
-    """Sums over planes (pixel, pair) of the products of signals, in place."""
-    count, pixels, planes = signals.shape
+def _sum_pairs(signals: Movie, last: Movie, out: Movie) -> None:
+    """Sums over an event's planes (pixel, pair, event) of the products of signals, in place."""
+    count, pixels, turns, events = signals.shape
     for p in range(pixels):
         place = 0
         for i in range(count + 1):
             first = signals[i, p] if i < count else last[p]
             for j in range(i, count + 1):
-                second, total = signals[j, p] if j < count else last[p], np.float32(0.0)
-                for t in range(planes):
-                    total += first[t] * second[t]
-                out[p, place] = total
+                second, sums = signals[j, p] if j < count else last[p], out[p, place]
+                sums[:] = 0.0
+                for turn in range(turns):
+                    for event in range(events):
+                        sums[event] += first[turn, event] * second[turn, event]
                 place += 1
 
 
@@ -300,22 +310,12 @@ class Field:
         nodes = self.nodes.reshape(2, *self.spline.nodes)
         return np.stack([rows @ plane @ columns.T for plane in nodes])
 
-    @cached_property
-    def covariance(self) -> Array:
-        """Covariance (node, node) [pixel^2]."""
-        return self.spline.solved(self.factor, np.eye(self.nodes.size))
-
-    def disagreement(self, data: Information, centres: list[Array], field: "Field") -> float:
-        """Chi-square of another field by the data of this one, over what chance makes of it."""
-        matrix = _normal(data.tensor, *self.spline.values(centres))
-        off = field.nodes - self.nodes
-        return float(off @ matrix @ off / np.sum(self.covariance * matrix))
-
     def variances(self, centres: list[Array]) -> Array:
         """Variance (2, y, x) of the displacement at each place [pixel^2]."""
         rows, columns = (_pairs(pair) for pair in self.spline.values(centres))
         height, width = self.spline.nodes
-        blocks = self.covariance.reshape(2, height, width, 2, height, width)
+        covariance = self.spline.solved(self.factor, np.eye(self.nodes.size))
+        blocks = covariance.reshape(2, height, width, 2, height, width)
         planes = [blocks[axis, :, :, axis].transpose(0, 2, 1, 3) for axis in (0, 1)]
         return np.stack([rows @ it.reshape(height**2, width**2) @ columns.T for it in planes])
 

@@ -57,6 +57,9 @@ _MANY: Final = 0.3  # share of asynchronous pixels from which a shift does not e
 # Share of asynchronous pixels from which the clocks are compared: of scenes with one clock at most
 # 0.003, beside reflections at several depths; and the part of it that one clock may leave.
 _SOME, _LESS = 0.05, 0.5
+# Delay beside the shift from which they are [frame], in deviations: of displaced cameras of one
+# clock 0.012 at most, of clocks that differ by half a frame or more 0.4 to 0.9.
+_LATE, _SIGMAS = 0.05, 3.0
 
 
 @without_blas_threads
@@ -194,7 +197,7 @@ def _on_one_clock(
     outcome = once(capture)
     unchanged = capture, outcome, list[str]()
     names, share = capture["band"].values.tolist(), outcome[0].asynchronous
-    if share <= _SOME:
+    if share <= _SOME and not outcome[0].late:
         return unchanged
     try:
         with catch_warnings(record=True) as notes:  # said only if its clocks are taken
@@ -205,8 +208,8 @@ def _on_one_clock(
     # Not if a band lacks more samples than can be bridged: at steps none is interpolated.
     lost = ~schema.measured(_samples.some_pixels(aligned["counts"]))
     retry = outcome if lost.mean(axis=(1, 2)).max() > MOST_BRIDGED else once(aligned)
-    # Nor if it leaves a displacement that no shift explains.
-    less = retry[0].asynchronous < _LESS * share
+    # Nor if it leaves a delay, or a displacement that no shift explains.
+    less = retry[0].asynchronous <= max(_LESS * share, _SOME) and not retry[0].late
     if not less or len(retry[0].doubts) > len(outcome[0].doubts):
         return unchanged
     offsets, std = np.array(aligned.attrs["time_offset"]), aligned.attrs.get("time_offset_std")
@@ -266,6 +269,14 @@ class Measured:
     def sound(self) -> int:
         """Number of pixels without a flag."""
         return int(np.count_nonzero(self.result["status"].values == 0))
+
+    @property
+    def late(self) -> bool:
+        """Tell whether the bands show displaced reflections at different times."""
+        attrs = {} if self.reflection_shift is None else self.reflection_shift.attrs
+        delay, std = (attrs.get(name, 0.0) for name in ("delay", "delay_std"))
+        frame = np.median(np.diff(self.result["time"].values))
+        return bool(abs(delay) > max(_LATE * frame, _SIGMAS * std))
 
     @property
     def asynchronous(self) -> float:

@@ -40,7 +40,7 @@ def clocks_tried(
 
     monkeypatch.setattr(joint, "_shift", shift)
     scale = Scale(np.ones(len(bands)), None)
-    offset, _, left, _ = joint._clocked(small, scale, together, resample)
+    offset, _, left = joint._clocked(small, scale, together, resample)
     return (offset.values / FRAME).tolist(), tried, left / FRAME
 
 

@@ -192,6 +192,33 @@ def test_rapid_object_does_not_pull_the_field(
     check(capture, true, 0.7, 0.03)
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_touches_are_no_reflections(seed: int) -> None:
+    """Where an object is touched it changes as rapidly as the spots that switch before it."""
+    rng, time = np.random.default_rng(seed), np.arange(250) / 10.0
+    true, (y, x) = np.zeros((2, 48, 64)), np.indices((48, 64))
+    true[1] = 3.0
+    films = np.full((3, 250, 48, 64), 296.0)  # of the object, and what either camera sees mirrored
+    for touched in np.arange(20) % 3 == 0:
+        begin, row, column, width = rng.uniform([1.0, 0.0, 0.0, 2.0], [23.0, 48.0, 64.0, 4.0])
+        since = np.maximum(time - begin, 0.0)[:, np.newaxis, np.newaxis]
+        curve = np.exp(-since / 2.0) if touched else np.sin(2.5 * since) > 0.0
+        for film, shift in ((0, 0.0),) if touched else ((1, 0.0), (2, 3.0)):
+            place = np.hypot(y - row, x + shift - column) / width
+            films[film] += 8.0 * (since > 0.0) * curve * np.exp(-0.5 * place**2)
+    scene = simulation.scene(time, films[0], films[1], GLASS)
+    dims = ("band", *scene["object_temperature"].dims)
+    scene["background_temperature"] = dims, films[1:], {"units": "K"}
+    field = alignment.reflection_shift(simulation.observe(scene, QUIET, rng), QUIET)
+    error, score = errors(field, true)
+    late = 10.0 * field.attrs["delay"]  # [frame]
+    print(f"{np.median(np.abs(error[1])):.4f} pixel off, {np.sqrt(np.mean(score[1] ** 2)):.1f}")
+    print(f"{late:.4f} frames late")
+    assert np.median(np.abs(error[1])) < 0.04
+    assert np.quantile(np.abs(error[1]), 0.95) < 0.2
+    assert abs(late) < 0.012
+
+
 @pytest.mark.parametrize(
     "seed",
     [
@@ -247,7 +274,7 @@ test_refuses_what_tells_no_shift = refused(
         (STILL.assign(status=DEAD.assign_attrs(schema.status_attrs())), "Missing texture"),
         (STILL.isel(band=[0]), "Must be two or more"),
         (STILL.isel(y=slice(20)), "20 rows"),
-        (STILL.isel(time=slice(10)), "10 frames"),
+        (STILL.isel(time=slice(10)), "number 10 of frames"),
     ],
 )
 

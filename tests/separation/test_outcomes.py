@@ -79,7 +79,7 @@ BOUNDS: Final[dict[str, Bounds]] = {
     "lamp, apart": Bounds(0.20, 0.165, (0.83, 0.99), 0.03, 0.007, 0.15, 0.87, shift="found"),
     # What no shift explains is warned of; the rest is as good as it comes.
     "two depths": Bounds(
-        0.34, 0.82, (0.69, 0.98), 0.04, 0.026, p90=0.92, whole=0.75, shift="found", said="The bands"
+        0.5, 0.5, (0.92, 0.99), 0.04, 0.026, p90=0.6, whole=0.9, shift="found", said="The bands"
     ),
 }
 # Bounds that are missed since the ratios of cameras apart are those of maps.
