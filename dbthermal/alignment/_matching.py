@@ -234,7 +234,7 @@ def _positive(tensor: Array) -> Array:
 def start(movies: Movies, planes: list[Movie], spline: Spline) -> Field | None:
     """Field of whole-pixel matches of planes, wrong ones taken for outliers; None without any."""
     reach = movies.valid.shape[0] // 3, movies.valid.shape[1] // 3
-    levels = np.float32(movies.noise * _VALUE_NOISE)
+    levels = (movies.noise * _VALUE_NOISE).astype(np.float32)
     pictures = [images.blurred(it, BLUR) / level for it, level in zip(planes, levels, strict=True)]
     rough, share = _whole_pixels(pictures[0], pictures[1:], float(movies.freedom.sum()), reach)
     share *= movies.valid
