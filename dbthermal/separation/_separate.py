@@ -57,8 +57,8 @@ _MANY: Final = 0.3  # share of asynchronous pixels from which a shift does not e
 # Share of asynchronous pixels from which the clocks are compared: of scenes with one clock at most
 # 0.003, beside reflections at several depths; and the part of it that one clock may leave.
 _SOME, _LESS = 0.05, 0.5
-# Delay beside the shift from which they are [frame], in deviations: of displaced cameras of one
-# clock 0.012 at most, of clocks that differ by half a frame or more 0.4 to 0.9.
+# Delay beside a shift from which clocks are compared [frame], and in deviations: of cameras of one
+# clock 0.012 at most, of clocks half a frame or more apart 0.4 to 0.9.
 _LATE, _SIGMAS = 0.05, 3.0
 
 
