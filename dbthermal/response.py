@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from dbthermal import _numbers, _text, planck, schema
+from dbthermal import _numbers, planck, schema
 from dbthermal._arrays import Array
 
 __all__ = [
@@ -255,7 +255,8 @@ def curve(response: xr.Dataset, band: str, kind: str = "exact") -> Curve:
 
 def curves(response: xr.Dataset, bands: Sequence[str], kind: str = "exact") -> list[Curve]:
     """Curves of bands by name, see `curve`; the response is checked once."""
-    _text.check_listed("Unknown kind of response", kind, KINDS)
+    if kind not in KINDS:
+        raise ValueError(f"Unknown kind of response '{kind}'. Must be one of {KINDS}.")
     schema.check(response, "response")
     places = schema.band_positions(response, list(bands), "the response")
     values = {str(name): response[name].values for name in schema.STAGES["response"]}
