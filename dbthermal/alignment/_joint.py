@@ -60,8 +60,7 @@ def compare(
 ) -> Comparison:
     """Clocks of the cameras of registered views; the stated ones unless the images contradict.
 
-    The scale of the bands is by default that of their changes. ValueError where nothing tells the
-    clocks, as `time_offset`.
+    The scale is by default that of changes. ValueError, as `time_offset`, if nothing tells clocks.
     """
     names = [str(name) for name in corrected["band"].values]
     synchronous = xr.DataArray(np.zeros(len(names)), {"band": names}, "band")
