@@ -106,7 +106,7 @@ def _whole_pixels(
     height, width = first.shape[:2]
     padded = np.pad(first, (*((by, by) for by in reach), (0, 0)))
     # Energies in variances of noise: movies are in deviations of noise.
-    energies = [np.einsum("yxt,yxt->yx", it, it) for it in (padded, *movies)]
+    energies = [np.einsum("yxt,yxt->yx", film, film) for film in (padded, *movies)]
     best, where = np.zeros((height, width)), np.zeros((2, height, width))
     for down in range(2 * reach[0] + 1):  # a row's pairs of pixels at once
         rows = slice(down, down + height)
@@ -183,18 +183,18 @@ def _information(
         uneven = free * np.maximum(window(along**2) - white * window(mm), 0.0)
         uneven /= np.maximum(window(mm**2), np.finfo(np.float64).tiny)
         share = uneven / (white + uneven * mm)
-        each, square, scale = np.array([ratio + share * along, ratio**2, white], "f4")[..., None]
-        squares, crosses, last = np.moveaxis(events[place], 2, 0)
+        local, square, scale = np.array([ratio + share * along, ratio**2, white], "f4")[..., None]
+        first, product, second = np.moveaxis(events[place], 2, 0)
         excess, reflected = (
             images.blurred(used[..., np.newaxis] * energy, WINDOW) / scale - numbers
-            for energy in (last - 2.0 * each * crosses + each**2 * squares, square * squares)
+            for energy in (second - 2.0 * local * product + local**2 * first, square * first)
         )
         # What the object does at the same time is in the residual of few events.
         outside = numbers * movies.outside
         expected = outside + tolerance * np.maximum(reflected, 0.0)
         updated[place] = np.maximum((outside + excess) / expected, 1.0)
         # What is tolerated of the events that count makes the window count less.
-        unexplained, chance = (np.sum(weights[place] * it, axis=2) for it in (excess, outside))
+        unexplained, chance = (np.sum(weights[place] * n, axis=2) for n in (excess, outside))
         usual = np.maximum(1.0 + unexplained / np.maximum(chance, 1e-9), 1.0) if tolerance else 1.0
         yy, yx, xx = yy - share * my**2, yx - share * my * mx, xx - share * mx**2
         # By as much as the blur moves what it sees of an uneven ratio, the shift is not off.
@@ -235,7 +235,7 @@ def start(movies: Movies, planes: list[Movie], spline: Spline) -> Field | None:
     """Field of whole-pixel matches of planes, wrong ones taken for outliers; None without any."""
     reach = movies.valid.shape[0] // 3, movies.valid.shape[1] // 3
     levels = (movies.noise * _VALUE_NOISE).astype(np.float32)
-    pictures = [images.blurred(it, BLUR) / level for it, level in zip(planes, levels, strict=True)]
+    pictures = [images.blurred(x, BLUR) / level for x, level in zip(planes, levels, strict=True)]
     rough, share = _whole_pixels(pictures[0], pictures[1:], float(movies.freedom.sum()), reach)
     share *= movies.valid
     if not share.any():
@@ -302,9 +302,9 @@ def delay(movies: Movies, rate: Movie, shift: Array, misfits: Movie) -> tuple[fl
     weights = np.where(used[..., np.newaxis], 1.0 / misfits, np.float32(0.0))
     moments, _ = images.products(movies.first, movies.targets, places, weights, rate)
     totals = np.zeros((4, *movies.valid.shape))
-    for array, each, level in zip(moments, weights, movies.noise[1:], strict=True):
+    for array, weight, level in zip(moments, weights, movies.noise[1:], strict=True):
         windows = images.blurred(array, WINDOW)
-        freedom = gaussian_filter(each @ movies.freedom, WINDOW)
+        freedom = gaussian_filter(weight @ movies.freedom, WINDOW)
         # Noise of the slopes and of the moved movie.
         less = freedom[..., np.newaxis] * movies.noise[0] ** 2
         less = less * np.square([_VALUE_NOISE, _SLOPE_NOISE, _SLOPE_NOISE, 0.0])

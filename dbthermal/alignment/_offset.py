@@ -363,12 +363,12 @@ def bent(
     The `pair` (2, time, pixel) [count] holds y at the `times` [s], and x at its own times.
     """
     timed, valid = present(pair[1]) & np.isfinite(plan.stamps), plan.valid & present(pair[0])
-    both, rate = present(pair[0]) & timed, clocks.frame_period(plan.stamps)
+    shared, rate = present(pair[0]) & timed, clocks.frame_period(plan.stamps)
     alike = abs(clocks.frame_period(times) - rate) < _ALIKE * rate
     if not (alike and plan.bend.any() and min(valid.sum(), timed.sum()) >= _MINIMUM_FRAMES):
         return plan
     try:
-        power = np.square(noises.estimate(pair[0, both], pair[1, both], times[both]))
+        power = np.square(noises.estimate(pair[0, shared], pair[1, shared], times[shared]))
     except ValueError:  # without noise
         return plan
     # Rapid changes of y, and of x by the line and by the cubic; samples without a step.
@@ -380,7 +380,7 @@ def bent(
     # Without the smooth functions white noise adds -_ORDER / n of its variance to the products of
     # neighbouring frames: it is taken out.
     pairs = (y, valid), (_rapid(pair[1], plan.stamps, timed, segment), timed)
-    autos = [dot(z[1:], z[:-1]) / np.sum(it[1:] & it[:-1]) for z, it in pairs]
+    autos = [dot(z[1:], z[:-1]) / np.sum(use[1:] & use[:-1]) for z, use in pairs]
     auto_y, auto_x = np.array(autos) + _ORDER / valid.sum() * power[:, np.newaxis]
     late, early = dot(y[1:], x[:-1]), dot(y[:-1], x[1:])
     # Interpolated frames vary less: scale their products, alike in all pixels, to the samples'.

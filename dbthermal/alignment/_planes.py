@@ -59,7 +59,7 @@ class Scale:
     @classmethod
     def of_response(cls, response: xr.Dataset, names: list[str]) -> "Scale":
         """Scale of a response, and of its noise if it states one."""
-        slopes = np.array([it.reference_slope for it in responses.curves(response, names)])
+        slopes = np.array([curve.reference_slope for curve in responses.curves(response, names)])
         noise = responses.noise(response, names) / slopes if "noise" in response else None
         return cls(slopes, noise)
 
