@@ -266,9 +266,9 @@ MARKS: Final = ("<!-- the default call, by make bench -->", "<!-- end of the def
 
 DEFAULT_CALL: Final = """The scene is a plate of glass that is heated while people walk by:
 {rows}x{columns} pixels, {frames} frames, two bands. `separation.separate` is the default call;
-`solve` works pixel by pixel. "Displaced" cameras see a reflection in different pixels: `solve` then
-needs the reflection shift, and the search for the shift is not in its time. `solve` then couples
-neighbouring pixels, which takes time and reduces the error.
+`solve` separates pixel by pixel. For "displaced" cameras, which see a reflection in different
+pixels, `solve` couples neighbouring pixels, which takes time and reduces the error; its time does
+not include the search for the reflection shift.
 
 The first call, which compiles, is not counted. Time per pixel is processor time of one thread.
 Frames per second are computed from this time, for two cores and 640x512 pixels. "Error" is that of
@@ -290,11 +290,11 @@ Processor time and accuracy, measured by `make bench` on simulated captures. The
 
 ## Every method
 
-Processor time of one thread, for {frames} frames of two bands. Each method separates as many pixels
-as it can in less than {longest:.0f} s (column "pixels"). `subspace` is the method of `solve`. Its
-time per pixel is shorter than in the table above, because time per pixel falls with the number of
-pixels ({scene} above). Times for 3 and for 4 bands are multiples of the time for two bands, with
-{pixels} pixels; "none": the method takes two bands only. Load average at the start: {busy:.1f}.
+Processor time of one thread, for {frames} frames of two bands. Column "pixels": as many as the
+method separates in less than {longest:.0f} s. `subspace` is the method of `solve`. Its time per
+pixel falls with the number of pixels, and is longer in the table above ({scene} pixels). Times
+for 3 and for 4 bands are multiples of the time for two bands, with {pixels} pixels; "none": the
+method takes two bands only. Load average at the start: {busy:.1f}.
 
 {methods}
 """
