@@ -101,7 +101,7 @@ FRAME_FLAGS: Final = _of("band time", "1", "flags of the frame, 0 is good", "uin
 SHUTTER_CLOSED: Final = "shutter_closed"
 """Name, in `frame_flags`, of the bit of a frame taken while the camera's shutter was closed."""
 
-NOISE_FACTOR: Final = _of("band", "1", "noise after over noise before the alignment")
+NOISE_FACTOR: Final = _of("band", "1", "noise after the alignment over that before")
 """Variable `noise_factor`: by how much interpolation between frames has lessened the noise."""
 
 PATTERN_STD: Final = _of("band", "count", "standard deviation of the residual fixed pattern")
@@ -210,7 +210,7 @@ OPTIONAL: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
             "emissivity_covariance": _of(
                 "band other_band y x", "1", "covariance of band emissivities", "float32"
             ),
-            "drift_std": _of("y x", "1", "reference emissivity's std by drift", "float32"),
+            "drift_std": _of("y x", "1", "drift part of the reference emissivity std", "float32"),
             "noise": _of("band", "count", "noise that was used"),
             "bridged": _of("time y x", "1", "interpolated in time, not measured", "bool"),
             "material": _of("y x", "1", "material, -1 for none", "int32"),
@@ -305,7 +305,7 @@ class Status(Flags):
     """
 
     NO_BACKGROUND_MOTION = 1 << 0, "no rapid change of the reflection: nothing is measured"
-    CONSTANT_OBJECT = 1 << 1, "constant object: its temperature is valid, nothing else is given"
+    CONSTANT_OBJECT = 1 << 1, "constant object: temperature valid; no emissivity or background"
     GRAY = 1 << 2, "the emissivities of the bands hardly differ: no temperature is measured"
     BACKGROUND_NEVER_RESTS = 1 << 3, "reflection at rest in few frames: emissivity may be biased"
     NONPHYSICAL_EMISSIVITY = 1 << 4, "estimated emissivity outside (0, 1): temperature not measured"
@@ -319,7 +319,7 @@ class Status(Flags):
     NOT_CONVERGED = 1 << 12, "the optimiser stopped at its limit of steps or at no finite value"
     OBJECT_JUMP = 1 << 13, "sudden steps of the object, part of its curve; the values are valid"
     BANDS_APART = 1 << 14, "rapid changes differ between the bands: time offset or parallax"
-    ROLES_MAY_BE_SWAPPED = 1 << 15, "object and background exchanged? low emissivity, lasting step"
+    ROLES_MAY_BE_SWAPPED = 1 << 15, "object may be the background: low emissivity or lasting step"
     COMPLETED_FROM_MATERIAL = 1 << 16, "completed, not measured: emissivity from the same material"
     COMPLETED_FROM_PRIOR = 1 << 17, "completed, not measured: emissivity from a library, or stated"
     COMPLETED_FROM_SURROUNDINGS = 1 << 18, "completed, not measured: background from surroundings"
