@@ -13,18 +13,31 @@ from dbthermal._arrays import Array
 
 Limits = tuple[float, float]
 
-# Limits of what is finite and positive; of counts or kelvin that a detector may have; and of a
-# temperature [K] that is in kelvin, and not in degrees Celsius or counts.
+# Limits, and what a value beyond is told.
 POSITIVE: Final = (np.nextafter(0.0, 1.0), np.finfo(np.float64).max)
-FINITE: Final = (-1e9, 1e9)
-KELVIN: Final = (150.0, 3000.0)
+FINITE: Final = (-1e9, 1e9)  # counts or kelvin that a detector may have
+KELVIN: Final = (150.0, 3000.0)  # temperature [K]
+FRACTION: Final = (POSITIVE[0], np.nextafter(1.0, 0.0))  # neither 0 nor 1
+NETD: Final = (POSITIVE[0], 5.0)  # [K]; thermopile arrays have 1 K, the quietest cameras 10 mK
+WAVELENGTH: Final = (POSITIVE[0], 0.3)  # [m] of a radiometer, up to microwaves of 1 GHz
+_RULES: Final = {
+    POSITIVE: "be finite and positive",
+    KELVIN: f"lie in {[*KELVIN]}: in kelvin, not in degrees Celsius or counts",
+    FRACTION: "lie in (0, 1)",
+    NETD: f"be finite and positive, at most {NETD[1]}: in kelvin, not in millikelvin",
+    WAVELENGTH: f"be finite and positive, at most {WAVELENGTH[1]}: in metres, not in micrometres",
+}
 
 
 def real_numbers(
     name: str, value: Any, within: Limits | None = None, shape: tuple[int, ...] | None = None
 ) -> Array:
     """Value as a float array, of a shape and within limits if they are given."""
-    raw = np.asarray(value)
+    try:
+        raw = np.asarray(value)
+    except (TypeError, ValueError) as error:  # of a Dataset, or of rows of several lengths
+        kind = type(value).__name__
+        raise TypeError(f"Invalid {name} of type {kind}. Must be numbers in equal rows.") from error
     if raw.dtype.kind not in "fui":
         (first,) = raw.reshape(-1)[:1].tolist() or [value]
         kind = type(first).__name__
@@ -37,8 +50,7 @@ def real_numbers(
         raise ValueError(f"Invalid {name} {value!s:.60} of shape {raw.shape}. Must have {shape}.")
     array = raw.astype(np.float64, copy=False)
     if within and np.any(bad := ~((array >= within[0]) & (array <= within[1]))):
-        rule = "be finite and positive" if within is POSITIVE else f"lie in {[*within]}"
-        rule += ": in kelvin, not in degrees Celsius or counts" if within is KELVIN else ""
+        rule = _RULES.get(within, f"lie in {[*within]}")
         raise ValueError(f"Invalid {name} {raw[bad].flat[0]}. Must {rule}.")
     return array
 

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from scipy import constants
 
 from dbthermal._arrays import Array
-from dbthermal._numbers import POSITIVE, real_numbers
+from dbthermal._numbers import POSITIVE, WAVELENGTH, real_numbers
 
 __all__ = [
     "FIRST_RADIATION_CONSTANT",
@@ -31,11 +31,6 @@ SECOND_RADIATION_CONSTANT: float = constants.h * constants.c / constants.k
 Spectral = Callable[[npt.ArrayLike, npt.ArrayLike], Array]
 
 
-def require_positive(name: str, value: npt.ArrayLike) -> Array:
-    """Value as a float array; every element must be finite and positive, or a ValueError."""
-    return real_numbers(name, value, POSITIVE)
-
-
 def spectral_radiance(wavelength: npt.ArrayLike, temperature: npt.ArrayLike) -> Array:
     r"""Spectral radiance of a blackbody [W m^-2 sr^-1 m^-1].
 
@@ -44,8 +39,8 @@ def spectral_radiance(wavelength: npt.ArrayLike, temperature: npt.ArrayLike) -> 
     The first equation of the paper (doi:10.48550/arXiv.2509.11334) has the factor :math:`\lambda^5`
     and the :math:`-1` on one level of the denominator; this is the law as Planck gave it.
 
-    ValueError if a wavelength or a temperature is not finite and positive, or a DataArray of
-    another unit; TypeError if it is no real number.
+    ValueError if a wavelength or a temperature is not finite and positive, a wavelength beyond
+    0.3 m, or a DataArray of another unit; TypeError if it is no real number.
 
     Parameters
     ----------
@@ -62,8 +57,8 @@ def spectral_radiance(wavelength: npt.ArrayLike, temperature: npt.ArrayLike) -> 
     >>> round(float(brightness_temperature(10e-6, 0.9 * radiance)), 1)  # [K]
     293.6
     """
-    wavelength = require_positive("wavelength [m]", wavelength)
-    temperature = require_positive("temperature [K]", temperature)
+    wavelength = real_numbers("wavelength [m]", wavelength, WAVELENGTH)
+    temperature = real_numbers("temperature [K]", temperature, POSITIVE)
     exponent = SECOND_RADIATION_CONSTANT / (wavelength * temperature)
     # exp(-x) / (1 - exp(-x)) in place of 1 / (exp(x) - 1): no overflow on the Wien side.
     factor = FIRST_RADIATION_CONSTANT / wavelength**5
@@ -103,7 +98,7 @@ def brightness_temperature(wavelength: npt.ArrayLike, radiance: npt.ArrayLike) -
 
     See the example of `spectral_radiance`.
     """
-    wavelength = require_positive("wavelength [m]", wavelength)
-    radiance = require_positive("spectral radiance [W m^-2 sr^-1 m^-1]", radiance)
+    wavelength = real_numbers("wavelength [m]", wavelength, WAVELENGTH)
+    radiance = real_numbers("spectral radiance [W m^-2 sr^-1 m^-1]", radiance, POSITIVE)
     ratio = FIRST_RADIATION_CONSTANT / (wavelength**5 * radiance)
     return np.asarray(SECOND_RADIATION_CONSTANT / (wavelength * np.log1p(ratio)))

@@ -144,9 +144,7 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
 def _check_options(step: Callable[..., Any], options: Any) -> None:
     """Refuse options that are no mapping, or that a step does not take by name."""
     name = step.__name__
-    if not isinstance(options, Mapping):
-        kind = type(options).__name__
-        raise TypeError(f"Invalid options of '{name}' of type {kind}. Must be a mapping by name.")
+    schema.require(options, Mapping, f"options of '{name}'")
     hidden = {"lazy", "reflection_shift"} if step is align else {"lazy"}
     by_name = [it for it in signature(step).parameters.values() if it.kind is it.KEYWORD_ONLY]
     names = [it.name for it in by_name if it.name not in hidden]

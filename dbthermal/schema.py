@@ -16,6 +16,8 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from dbthermal import _numbers
+
 __all__ = [
     "COMPLETED",
     "COORDINATES",
@@ -334,11 +336,6 @@ COMPLETED: Final = Status(sum(bit for bit in Status if bit.label.startswith("com
 """Bits of a pixel of which something is completed, not measured."""
 
 
-def status_attrs() -> dict[str, object]:
-    """CF attributes of a `status` variable: `flag_masks` (uint32), `flag_meanings`, units."""
-    return Status.cf_attrs(STATUS)
-
-
 def has_flag(flags: xr.DataArray, *names: str) -> xr.DataArray:
     """Mask of the places where any of some flags is set, by the CF attributes of the variable.
 
@@ -353,7 +350,7 @@ def has_flag(flags: xr.DataArray, *names: str) -> xr.DataArray:
     Examples
     --------
     >>> import numpy as np, xarray as xr
-    >>> status = xr.DataArray(np.uint32([0, 1024, 128]), dims="x", attrs=status_attrs())
+    >>> status = xr.DataArray(np.uint32([0, 1024, 128]), dims="x", attrs=Status.cf_attrs(STATUS))
     >>> has_flag(status, "dead_pixel", "gray").values
     array([False,  True, False])
     """
@@ -520,6 +517,15 @@ def require_rising(values: npt.NDArray[np.float64], label: str, units: str) -> N
         place = int(np.argmax(wrong))
         pair = f"{values[place]} {units} is followed by {values[place + 1]} {units}"
         raise ValueError(f"Unordered {label}: {pair}. Must increase strictly.")
+
+
+def rising_numbers(values: Any, label: str, units: str, least: int = 2) -> npt.NDArray[np.float64]:
+    """Values (n,), so many or more, as a float array, if they increase strictly; else an error."""
+    array = _numbers.real_numbers(f"{label} [{units}]", values)
+    if array.ndim != 1 or array.size < least:
+        raise ValueError(f"Invalid {label} of shape {array.shape}. Must be {least} or more.")
+    require_rising(array, label, units)
+    return array
 
 
 def pixel_status(capture: xr.Dataset) -> npt.NDArray[np.uint32]:

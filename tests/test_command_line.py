@@ -637,7 +637,7 @@ separate aligned.zarr response.zarr --offset nan -o x.zarr -> --offset: Invalid 
 plan --noise {"9" * 400} -> argument --noise: Invalid number '999
 plan --noise 30mK -> argument --noise: Invalid number '30mK'. Must be digits
 plan --noise -0.03 -> Invalid noise .K. -0.03. Must be finite and positive
-plan --noise 30 -> Invalid noise 30 K. Must be below 5 K: 30 mK are 0.03 K
+plan --noise 30 -> Invalid noise .K. 30.0. .*, at most 5.0: in kelvin, not in millikelvin
 calibrate a5.tif b5.tif -o x.zarr -> arguments: a5.tif b5.tif. .* dbthermal calibrate --at 10C a
 calibrate a5.tif b5.tif -> required: -o/--output. .* dbthermal calibrate --at 10C a10.tif
 separate scene.zarr response.zarr --corrected-by-camera --register none --offset 0 -o camera.zarr

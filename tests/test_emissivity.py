@@ -200,7 +200,6 @@ test_tables_that_rank_no_filter = refused(
         (partial(rank_filters, beside="10.6"), GLASSY, noise_of(0.03, 0.03), "Must hold '10.6'"),
         (condition_numbers, table(m=[0.9]), "Must be at least two"),
         (pair_summary, np.ones(3), "Invalid condition numbers of type ndarray"),
-        (emissivity.filter_noise, -0.03, FILTERS, "Invalid noise [K] -0.03"),
         (emissivity.filter_noise, "0.03", ["8-14"], "Invalid noise [K] '0.03'"),
         (emissivity.library_mixture, ["x"], "Invalid bands ['x'] of the library's emissivities"),
     ],

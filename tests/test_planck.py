@@ -28,7 +28,7 @@ def test_stefan_boltzmann(temperature: float) -> None:
         return float(np.pi * wavelength * planck.spectral_radiance(wavelength, temperature))
 
     centre = np.log(planck.SECOND_RADIATION_CONSTANT / temperature)
-    total = quad(per_octave, centre - 5.0, centre + 10.0, epsabs=0, epsrel=1e-11, limit=200)[0]
+    total = quad(per_octave, centre - 5.0, centre + 7.0, epsabs=0, epsrel=1e-11, limit=200)[0]
     assert total / temperature**4 == pytest.approx(constants.Stefan_Boltzmann, rel=1e-9)
 
 
@@ -73,7 +73,6 @@ def test_brightness_temperature_inverts(wavelength: float, temperature: float) -
     [
         ("wavelength [m]", planck.spectral_radiance, (None, 300.0)),
         ("temperature [K]", planck.spectral_radiance, (1e-5, None)),
-        ("temperature [K]", planck.spectral_radiance_slope, (1e-5, None)),
         ("spectral radiance [W m^-2 sr^-1 m^-1]", planck.brightness_temperature, (1e-5, None)),
     ],
 )
@@ -81,7 +80,7 @@ def test_bad_value_is_named(
     name: str, function: planck.Spectral, arguments: tuple[float | None, ...], bad: float
 ) -> None:
     """Each quantity must be finite and positive, and the error gives name, unit and value."""
-    first, second = ([1.0, bad] if value is None else value for value in arguments)
+    first, second = ([1e-5, bad] if value is None else value for value in arguments)
     with pytest.raises(ValueError, match=re.escape(f"Invalid {name} {bad}. Must be finite")):
         function(first, second)
 
@@ -91,8 +90,8 @@ def test_bad_value_is_named(
 )
 def test_what_is_no_number_is_refused(value: object) -> None:
     """Text, truth values, durations, complex numbers and objects raise a TypeError."""
-    with pytest.raises(TypeError, match=r"Invalid length \[m\] .* Must be a number, not of type"):
-        planck.require_positive("length [m]", value)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=r"Invalid temperature \[K\] .* Must be a number, not of"):
+        planck.spectral_radiance_slope(1e-5, value)  # type: ignore[arg-type]
 
 
 def test_stated_units_must_agree() -> None:

@@ -117,7 +117,7 @@ def test_status_bits_are_documented() -> None:
 
 def test_status_attributes_follow_cf() -> None:
     """One mask a meaning, in the dtype of the status."""
-    attrs = schema.status_attrs()
+    attrs = Status.cf_attrs(schema.STATUS)
     masks, meanings = attrs["flag_masks"], str(attrs["flag_meanings"]).split()
     assert isinstance(masks, np.ndarray)
     assert masks.dtype == np.dtype(schema.STAGES["separated"]["status"].dtype)
@@ -142,7 +142,7 @@ def test_status_of_16_bits_still_opens(tmp_path: Path) -> None:
 
 def test_flags_are_read_by_name() -> None:
     """Any of several flags counts; an unknown name raises an error."""
-    status = xr.DataArray(np.array([0, 1, 1024]), dims="x", attrs=schema.status_attrs())
+    status = xr.DataArray(np.array([0, 1, 1024]), dims="x", attrs=Status.cf_attrs(schema.STATUS))
     found = schema.has_flag(status, "dead_pixel", "no_background_motion")
     np.testing.assert_array_equal(found, [False, True, True])
     assert found.dtype == bool

@@ -118,7 +118,8 @@ def exposure_times(corrected: xr.Dataset) -> Array:
     else:
         stamps = corrected["exposure_time"].values.astype(np.float64)
     for band, row in zip(counts["band"].values, stamps, strict=True):
-        _check_stamps(row[~np.isnan(row)], f"band '{band}'")
+        label = f"exposure times of band '{band}'"
+        schema.rising_numbers(row[~np.isnan(row)], label, "s", _MINIMUM_FRAMES)
     return stamps
 
 
@@ -133,19 +134,13 @@ def fill_times(stamps: Array) -> Array:
         increase.
     """
     stamps = _numbers.real_numbers("exposure times [s]", stamps)
-    _check_stamps(stamps[~np.isnan(stamps)], "the camera")
+    label = "exposure times of the camera"
+    schema.rising_numbers(stamps[~np.isnan(stamps)], label, "s", _MINIMUM_FRAMES)
     slots, step = np.arange(stamps.size), frame_period(stamps)
     recorded = np.flatnonzero(np.isfinite(stamps))
     interpolated = np.interp(slots, recorded, stamps[recorded])
     outside = slots - np.clip(slots, recorded[0], recorded[-1])
     return np.asarray(interpolated + step * outside)
-
-
-def _check_stamps(stamps: Array, label: str) -> None:
-    if stamps.size < _MINIMUM_FRAMES or not np.all(np.isfinite(stamps)):
-        rule = f"Must be finite, {_MINIMUM_FRAMES} at least, or NaN where there is no frame"
-        raise ValueError(f"Invalid exposure times of {label}: {stamps.size} stamps. {rule}.")
-    schema.require_rising(stamps, f"exposure times of {label}", "s")
 
 
 def missing(frames: npt.NDArray[Any]) -> Mask:

@@ -7,7 +7,7 @@ import numpy as np
 import xarray as xr
 from scipy.ndimage import gaussian_filter, median_filter, spline_filter
 
-from dbthermal import schema
+from dbthermal import _text, schema
 from dbthermal._arrays import Array, Mask
 from dbthermal._smooth import polynomial_basis
 from dbthermal.alignment import _clocks as clocks
@@ -99,8 +99,7 @@ def register(
     >>> transform.sel(band="9.5").values[:2, 2].round(1).tolist()  # [pixel]
     [3.0, 2.0]
     """
-    if model not in _MODELS:
-        raise ValueError(f"Unknown model '{model}'. Must be one of {_MODELS}.")
+    _text.check_listed("Unknown model", model, _MODELS)
     counts = schema.check(corrected, "corrected")["counts"]
     # The longest segment: a new pattern would be detail that does not move.
     if "segment" in corrected:

@@ -8,7 +8,7 @@ import numpy.typing as npt
 import xarray as xr
 from scipy.sparse import csr_array, diags_array, eye_array
 
-from dbthermal import _arrays, _numbers, schema
+from dbthermal import _arrays, _numbers, _text, schema
 from dbthermal._arrays import Array, Mask
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment import _offset as lags
@@ -207,8 +207,7 @@ def on_one_clock(
         lags.require_one_clock(corrected.isel(band=pair), signals[pair], stamps[pair])
     # The clock of the noisiest band, relative to its signal.
     noise, relative = lags.noise_levels(signals, stamps)
-    if clock is not None and clock not in names:
-        raise ValueError(f"Unknown clock '{clock}'. Must be one of the bands {names}.")
+    _text.check_listed("Unknown clock", clock, [None, *names])
     reference = int(np.argmax(relative)) if clock is None else names.index(clock)
     times, segment = clocks.fill_times(stamps[reference]), schema.segments(corrected)
     # Plan the interpolation of each band, and how it reduces noise.

@@ -125,7 +125,7 @@ def fit_response(  # noqa: PLR0913 - what is known of blackbody and cameras, by 
     noises = np.zeros(len(names))
     if noise is not None:
         noises = schema.band_values(noise, names, "the noise", "count")
-        planck.require_positive("noise [count]", noises)
+        _numbers.real_numbers("noise [count]", noises, _numbers.POSITIVE)
     # Fit curve and line of each band, and refuse counts that follow no Planck curve.
     curves, lines = [], []
     for name, row, std in zip(names, values, noises, strict=True):
@@ -286,10 +286,8 @@ def _response(curves: list[Curve], lines: list[Array]) -> xr.Dataset:
 
 def _check_blackbody(counts: xr.DataArray) -> None:
     schema.check_variable(counts, schema.STAGES["blackbody"]["counts"], "the blackbody counts")
-    temperature = planck.require_positive("temperature [K]", counts["temperature"].values)
-    if temperature[0] < bands.TEMPERATURE_RANGE[0]:
-        rule = f"Must be at least {bands.TEMPERATURE_RANGE[0]} K; temperatures are in kelvin"
-        raise ValueError(f"Invalid temperature {temperature[0]} K of a blackbody. {rule}.")
+    temperature = counts["temperature"].values
+    _numbers.real_numbers("temperature [K] of a blackbody", temperature, _numbers.KELVIN)
     if temperature.size < MINIMUM_TEMPERATURES:
         rule = f"Must be at least {MINIMUM_TEMPERATURES}"
         raise ValueError(f"Invalid number of blackbody temperatures {temperature.size}. {rule}.")

@@ -265,7 +265,7 @@ def correct(
     status = bad * np.uint32(Status.DEAD_PIXEL) | saturated * np.uint32(Status.SATURATED)
     result = capture.drop_vars("counts").assign(
         counts=(counts.dims, corrected, schema.STAGES["corrected"]["counts"].attrs),
-        status=(("y", "x"), status, schema.status_attrs()),
+        status=(("y", "x"), status, Status.cf_attrs(schema.STATUS)),
     )
     if correction.keys() >= _PATTERN:
         result["pattern_std"] = _pattern_std(correction, result["counts"], status == 0)

@@ -134,7 +134,7 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
         jumping |= _jumps(movie, threshold * np.sqrt(2.0) * usual, stepped, reach)
     status = schema.pixel_status(corrected) | (noisy | jumping) * np.uint32(Status.DEAD_PIXEL)
     result = corrected.assign(
-        status=(("y", "x"), status, schema.status_attrs()),
+        status=(("y", "x"), status, Status.cf_attrs(schema.STATUS)),
         pattern_std=("band", stds, schema.PATTERN_STD.attrs),
     )
     # Warn of a strong pattern, and state what was found.
@@ -177,7 +177,8 @@ def mark_repeats(corrected: xr.Dataset, raw: xr.DataArray, *, shutter: bool) -> 
         frozen |= still & shutter
     bits = saturated * np.uint32(Status.SATURATED) | frozen * np.uint32(Status.FROZEN_FRAMES)
     status = corrected["status"].values.astype(np.uint32) | bits
-    return corrected.assign(status=(("y", "x"), status, schema.status_attrs())).assign_attrs(
+    variable = ("y", "x"), status, Status.cf_attrs(schema.STATUS)
+    return corrected.assign(status=variable).assign_attrs(
         saturated_pixels=int(np.count_nonzero(status & np.uint32(Status.SATURATED))),
         frozen_pixels=int(frozen.sum()),
     )

@@ -46,7 +46,6 @@ _GAP = 1e-6  # step of wavelength across which a spectrum is unknown [m]; librar
 _STEPS = 64  # of the integral of Planck's law, besides the steps of the spectrum
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
 _TEMPERATURE = 300.0  # of the object, at which a noise is stated [K]
-_LIMIT = 5.0  # of a noise [K]; thermopile arrays have 1 K, and the quietest cameras 10 mK
 _MASK: Final = schema.Variable(("y", "x"), "bool", "1", "pixels of foil")
 _FOIL: Final = 0.01  # of its ratio: weathered, 0.947 to 0.956 in all bands of `embedded_table`
 
@@ -226,11 +225,7 @@ def chosen_bands(bands: Bands) -> list[Band]:
 
 def _values(spectrum: xr.Dataset, material: str) -> tuple[Array, Array]:
     """Wavelength [m] and emissivity [1] of a spectrum, all finite."""
-    try:
-        values = schema.check(spectrum, "spectrum")["emissivity"]
-    except (TypeError, ValueError) as error:
-        error.add_note(f"In the spectrum of '{material}'.")
-        raise
+    values = schema.check(spectrum, "spectrum", label=f"the spectrum of '{material}'")["emissivity"]
     emissivity = values.values.astype(np.float64)
     wavelength = values["wavelength"].values.astype(np.float64)
     lowest, highest = schema.EMISSIVITY_LIMITS
@@ -283,7 +278,7 @@ def filter_noise(netd: float, bands: Bands) -> xr.DataArray:
         Noise-equivalent temperature difference in the first band [K].
     bands : mapping or iterable of Band or str
         Bands, or names of `bands.FILTERS`, each once; the first is the one that `netd` belongs to.
-        TypeError or ValueError for other bands, or an `netd` that is not in (0, 5) K.
+        TypeError or ValueError for other bands, or an `netd` that is not in (0, 5] K.
 
     Examples
     --------
@@ -291,9 +286,7 @@ def filter_noise(netd: float, bands: Bands) -> xr.DataArray:
     [0.04, 0.398, 0.15]
     """
     chosen = chosen_bands(bands)
-    netd = _numbers.real_number("noise [K]", netd, _numbers.POSITIVE)
-    if netd >= _LIMIT:
-        raise ValueError(f"Invalid noise {netd:g} K. Must be below {_LIMIT:g} K: 30 mK are 0.03 K.")
+    netd = _numbers.real_number("noise [K]", netd, _numbers.NETD)
     slopes = np.array([float(band.slope(_TEMPERATURE)) for band in chosen])
     noise, axes = netd * slopes[0] / slopes, {"band": [band.name for band in chosen]}
     attrs = {"units": "K", "long_name": "noise-equivalent temperature difference"}
@@ -350,7 +343,7 @@ def colour_of(
             raise ValueError(f"Invalid background_ratio {stated} of bands {bands}. {rule}.")
         pair = _numbers.real_numbers("background_ratio and its deviation", stated, shape=(2,))
         ratio, std = np.array([[1.0, pair[0]], [0.0, pair[1]]])
-    ratio = planck.require_positive("background_ratio", ratio)
+    ratio = _numbers.real_numbers("background_ratio", ratio, _numbers.POSITIVE)
     std = _numbers.real_numbers("background_ratio_std", std, (0.0, schema.LARGEST)) / ratio
     relative = np.hypot(std, std[reference]) * (np.arange(len(bands)) != reference)
     return Colour(ratio / ratio[reference], relative, *level)

@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 import xarray as xr
 
-from dbthermal import _numbers, bands, mixing, planck, schema
+from dbthermal import _numbers, bands, mixing, schema
 from dbthermal import response as responses
 from dbthermal._arrays import Array, Mask
 from dbthermal.limits import _fisher
@@ -295,7 +295,10 @@ def plan(
     filters = [place for place, name in enumerate(names) if name != beside]
     together = _numbers.whole_number("together", together, (1, len(filters)))
     sets = [[names.index(beside), *chosen] for chosen in combinations(filters, together)]
-    std = planck.require_positive("noise [K]", schema.band_values(noise, names, "the noise", "K"))
+    std = schema.band_values(noise, names, "the noise", "K")
+    for name, value in zip(names, std, strict=True):  # that of a filter may be any
+        within = _numbers.NETD if name == beside else _numbers.POSITIVE
+        _numbers.real_number(f"noise [K] in band '{name}'", value, within)
     bodies = [_fisher.TopHat(bands.get(name), temperature) for name in names]
     # Deviations of each combination: temperatures (material), other quantities (band, material).
     cases = []
@@ -363,9 +366,7 @@ def plan_durations(
     [0.4, 0.2]
     """
     design = CaptureDesign() if design is None else design
-    lengths = _numbers.real_numbers("seconds", seconds)
-    if lengths.ndim != 1 or lengths.size == 0 or np.any(np.diff(lengths) <= 0):
-        raise ValueError(f"Invalid seconds {lengths.tolist()}. Must increase strictly.")
+    lengths = schema.rising_numbers(seconds, "lengths", "s", least=1)
     plans = [plan(table, noise, replace(design, seconds=float(length))) for length in lengths]
     coordinate = xr.DataArray(lengths, dims="seconds", name="seconds", attrs={"units": "s"})
     result = xr.concat(plans, dim=coordinate, data_vars="all", combine_attrs="drop_conflicts")
@@ -405,10 +406,7 @@ def _sky(emissivity: Array, noise: Array, names: list[str]) -> Array:
 def _require_fractions(emissivity: xr.DataArray, of: str = "") -> None:
     """Refuse an emissivity (band, ...) outside (0, 1)."""
     for name, values in zip(emissivity["band"].values, emissivity.values, strict=True):
-        for value in values[~((values > 0) & (values < 1))]:
-            raise ValueError(
-                f"Invalid emissivity {value}{of} in band '{name}'. Must lie in (0, 1)."
-            )
+        _numbers.real_numbers(f"emissivity{of} in band '{name}'", values, _numbers.FRACTION)
 
 
 def _expected(

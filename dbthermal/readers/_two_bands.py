@@ -12,7 +12,6 @@ from scipy.constants import zero_Celsius
 
 from dbthermal import _numbers, schema
 from dbthermal._arrays import empty, stretches
-from dbthermal._text import shown
 from dbthermal.readers._recording import FileFlag
 
 _SCENE: Final = (5.0, 100.0)  # temperatures of a scene [degC]
@@ -188,6 +187,4 @@ def _check(recording: xr.Dataset, name: str) -> None:
             raise TypeError(f"Invalid dtype {dtype} of '{variable}' of {label}. Must be uint16.")
     stamps = recording["exposure_time"].values
     valid = stamps[~np.isnan(stamps)]
-    if not valid.size or not np.isfinite(valid).all() or np.any(np.diff(valid) <= 0):
-        rule = "Must be known, finite and rise; some may be NaN, not all"
-        raise ValueError(f"Invalid 'exposure_time' of {label} {shown(stamps)}. {rule}.")
+    schema.rising_numbers(valid, f"'exposure_time' of {label}", "s", least=1)

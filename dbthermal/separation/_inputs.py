@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
+from dbthermal import _numbers, schema
 from dbthermal import _samples as samples
 from dbthermal import noise as noises
-from dbthermal import planck, schema
 from dbthermal import response as responses
 from dbthermal._arrays import Array, Mask, stride
 from dbthermal.response import Curve
@@ -248,7 +248,7 @@ def decide_noise(
     names, slopes = [it.band for it in curves], np.array([it.reference_slope for it in curves])
     factor, decided = schema.noise_factor(capture), response.attrs.get("noise_source")
     if "noise_factor" in capture:
-        planck.require_positive("noise_factor of the corrected", factor)
+        _numbers.real_numbers("noise_factor of the corrected", factor, _numbers.POSITIVE)
     # With a stated noise: that, unless the capture proves more.
     if "noise" in response:
         stated_noise = np.asarray(responses.noise(response, names) / slopes)

@@ -340,7 +340,7 @@ def separated_dataset(
     variables = {}
     for name, array in arrays.items():
         dims = stage[name].dims
-        attrs = schema.status_attrs() if name == "status" else stage[name].attrs
+        attrs = schema.Status.cf_attrs(schema.STATUS) if name == "status" else stage[name].attrs
         shape = tuple(sizes[dim] for dim in dims)
         values = empty(shape, stage[name].dtype) if array is None else array
         variables[name] = (dims, values, {**attrs, **kept})

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import xarray as xr
 
-from dbthermal import _numbers, _text, bands, calibration, correction, mixing, planck, schema
+from dbthermal import _numbers, _text, bands, calibration, correction, mixing, schema
 from dbthermal import response as responses
 from dbthermal._arrays import Array
 
@@ -36,6 +36,7 @@ Randomness = np.random.Generator | int  # or its seed
 _BACKGROUNDS: Final = ("pulses", "random walk", "still")
 _CALIBRATION_POINTS: Final = 25
 _SLOPE_TEMPERATURE: Final = 300.0
+_TEMPERATURES: Final = ("object_temperature", "background_temperature")
 
 
 @dataclass(frozen=True)
@@ -78,8 +79,7 @@ class Background:
 
     def draw(self, time: Array, pixels: int, rng: Randomness) -> Array:
         """Background temperature (time, pixel) [K], one realisation a pixel, at times [s]."""
-        _check_times(time, "a background")
-        rng = np.random.default_rng(rng)
+        time, rng = schema.rising_numbers(time, "times of a background", "s"), _generator(rng)
         change = np.zeros((time.size, pixels))
         if self.kind == "pulses":
             number = rng.integers(self.count[0], self.count[1] + 1, pixels)
@@ -121,8 +121,9 @@ def heating(time: Array, start: float, stop: float, time_constant: npt.ArrayLike
     >>> heating(np.array([0.0, 10.0, 20.0]), 293.15, 313.15, 10.0).round(2).tolist()
     [293.15, 307.77, 313.15]
     """
-    _check_times(time, "a heating")
-    constant = planck.require_positive("time_constant [s]", time_constant)
+    time = schema.rising_numbers(time, "times of a heating", "s")
+    start, stop = _numbers.real_numbers("start and stop [K]", (start, stop), _numbers.FINITE, (2,))
+    constant = _numbers.real_numbers("time_constant [s]", time_constant, _numbers.POSITIVE)
     elapsed = (time - time[0]).reshape(-1, *(1,) * constant.ndim)
     # expm1 keeps the digits of a capture that is short against the time constant.
     rise = np.expm1(-elapsed / constant) / np.expm1(-elapsed[-1] / constant)
@@ -137,29 +138,30 @@ def scene(
     Parameters
     ----------
     time, object_temperature, background_temperature : Array
-        Times (time,) [s], two or more, increasing; temperatures (time, y, x), positive [K].
+        Times (time,) [s], two or more, increasing; temperatures (time, y, x), 150 to 3000 [K].
     emissivity : DataArray
-        Emissivity (band) or (band, y, x), in [0, 1], or a ValueError [1].
+        Emissivity (band) or (band, y, x), in [0, 1] [1], with the names of the bands.
 
     Returns
     -------
     Dataset
         Names, dims and units of the stage `separated` without its deviations.
+        TypeError or ValueError if an input is not as described.
     """
-    _check_times(time, "a scene")
-    planck.require_positive("object_temperature [K]", object_temperature)
-    planck.require_positive("background_temperature [K]", background_temperature)
+    time = schema.rising_numbers(time, "times of a scene", "s")
+    pair = object_temperature, background_temperature
+    films: dict[str, Any] = dict(zip(_TEMPERATURES, pair, strict=True))
+    size = (time.size, *np.shape(object_temperature)[1:], 1, 1)[:3]
+    for name, film in films.items():
+        films[name] = _numbers.real_numbers(f"{name} [K]", film, _numbers.KELVIN, size)
+    # Emissivities of the image, or of each of its pixels.
     schema.check_numbers(emissivity, "the emissivity", "1")
-    _numbers.real_numbers("emissivity", emissivity.values, (0.0, 1.0))
-    height, width = object_temperature.shape[1:]
-    values = emissivity.values.reshape(emissivity.shape[0], *emissivity.shape[1:] or (1, 1))
-    films = {
-        "object_temperature": np.asarray(object_temperature),
-        "background_temperature": np.asarray(background_temperature),
-        "emissivity": np.broadcast_to(values, (emissivity.shape[0], height, width)),
-    }
+    schema.band_positions(emissivity, [], "the emissivity")
+    shape = (emissivity["band"].size, *(size[1:] if emissivity.dims[1:] == ("y", "x") else ()))
+    _numbers.real_numbers("emissivity", emissivity.values, (0.0, 1.0), shape)
+    films["emissivity"] = np.broadcast_to(emissivity.values.T, (*size[:0:-1], shape[0])).T
     axes = {"band": emissivity["band"].values, "time": ("time", time, {"units": "s"})}
-    axes |= {"y": np.arange(height), "x": np.arange(width)}
+    axes |= dict(zip("yx", map(np.arange, size[1:]), strict=True))
     return xr.Dataset(schema.variables("separated", films), axes, {"origin": "simulated"})
 
 
@@ -171,6 +173,8 @@ def side_by_side(emissivity: xr.DataArray, shape: tuple[int, int]) -> xr.DataArr
     emissivity, shape : DataArray, tuple of int
         Emissivity (material, band) [1]; rows and columns of the image.
     """
+    shape = _image(shape)
+    schema.check_numbers(emissivity, "the emissivity", "1")
     table = emissivity.transpose("band", "material").values
     panel = np.arange(shape[1]) * table.shape[1] // shape[1]
     image = np.broadcast_to(table[:, np.newaxis, panel], (len(table), *shape))
@@ -219,7 +223,8 @@ def walkers(
     """
     stated = _numbers.real_numbers("temperatures [K]", temperatures, _numbers.KELVIN, (3,))
     level, skin, hottest = stated
-    rng = np.random.default_rng(rng)
+    time, rng = schema.rising_numbers(time, "times of a scene", "s"), _generator(rng)
+    shape = _image(shape)
     rows, columns = np.meshgrid(*(np.linspace(-1, 1, n) for n in shape), indexing="ij")
     # Object: heated in its middle.
     profile = np.exp(-(rows**2 + columns**2) / (2 * 0.5**2))
@@ -242,12 +247,19 @@ def walkers(
     return scene(time, warm, cold, emissivity)
 
 
-def _check_times(times: npt.ArrayLike, name: str) -> None:
-    """Refuse times (time,) [s] of a named thing that are not two or more, and increasing."""
-    array = _numbers.real_numbers(f"times [s] of {name}", times)
-    if array.ndim != 1 or array.size < 2:
-        raise ValueError(f"Invalid times of shape {array.shape} of {name}. Must be two or more.")
-    schema.require_rising(array, f"times of {name}", "s")
+def _image(shape: Sequence[int]) -> tuple[int, int]:
+    """Rows and columns of an image, of a pixel or more."""
+    _numbers.real_numbers("shape", shape, shape=(2,))
+    rows, columns = (_numbers.whole_number("shape", size, (1, 2**16)) for size in shape)
+    return rows, columns
+
+
+def _generator(rng: Randomness) -> np.random.Generator:
+    """Generator of random numbers, or that of a seed."""
+    try:
+        return np.random.default_rng(rng)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"Invalid rng {_text.shown(rng)}. Must be a Generator or seed.") from error
 
 
 @dataclass(frozen=True)
@@ -289,11 +301,10 @@ class Rig:
     def __post_init__(self) -> None:
         for name in self.bands:
             bands.get(name)
-        if len(self.noise) != len(self.bands):
-            raise ValueError(f"Invalid noise {self.noise} K. Must be one for each of {self.bands}.")
-        planck.require_positive("noise [K]", self.noise)
+        _numbers.real_numbers("noise [K]", self.noise, _numbers.NETD, (len(self.bands),))
         _numbers.real_number("offset [count]", self.offset, _numbers.FINITE)
-        for name in ("counts_per_kelvin", "lowest", "highest", "gain_std", "offset_std"):
+        _numbers.real_numbers("range [K]", (self.lowest, self.highest), _numbers.KELVIN)
+        for name in ("counts_per_kelvin", "gain_std", "offset_std"):
             _numbers.real_number(name, getattr(self, name), (0.0, schema.LARGEST))
         if not 0 <= _numbers.real_number("bad_fraction", self.bad_fraction) < 1:
             raise ValueError(f"Invalid bad_fraction {self.bad_fraction}. Must lie in [0, 1).")
@@ -318,18 +329,13 @@ class Rig:
         return result.assign_attrs(origin="simulated")
 
 
-def _blackbody(response: xr.Dataset, temperature: xr.DataArray) -> list[np.ndarray]:
-    """Counts of a blackbody in each band; the temperature may differ between the bands."""
-    names = [str(name) for name in response["band"].values]
-    levels = [temperature] * len(names)
+def _blackbody(curve: responses.Curve, temperature: xr.DataArray) -> Array:
+    """Counts of a blackbody in a band; the temperature may differ between the bands."""
     if "band" in temperature.dims:
-        places = schema.band_positions(temperature, names, str(temperature.name))
-        levels = [temperature.isel(band=place) for place in places]
-    curves = responses.curves(response, names)
-    return [
-        curve.counts(responses.require_range(level.values, curve, str(temperature.name)))
-        for level, curve in zip(levels, curves, strict=True)
-    ]
+        (place,) = schema.band_positions(temperature, [curve.band], str(temperature.name))
+        temperature = temperature.isel(band=place)
+    values = responses.require_range(temperature.values, curve, str(temperature.name))
+    return curve.counts(values)
 
 
 def observe(
@@ -368,22 +374,21 @@ def observe(
     schema.check_numbers(background, "'background_temperature' of the scene", "K")
     schema.check(response, "response", ("noise",))
     names = [str(name) for name in response["band"].values]
-    emitted = _blackbody(response, scene["object_temperature"])
-    reflected = _blackbody(response, background)
     schema.band_positions(scene, names, "the scene")
     # Mix emission and reflection in counts, and add noise.
-    rng = np.random.default_rng(rng)
+    rng = _generator(rng)
     movie = np.empty((len(names), *scene["object_temperature"].shape), dtype=dtype)
-    for index, name in enumerate(names):
-        emissivity = scene["emissivity"].sel(band=name).values
-        clean = mixing.leaving(emissivity, emitted[index], reflected[index])
-        noise = float(response["noise"].sel(band=name))
+    for index, curve in enumerate(responses.curves(response, names)):
+        emissivity = scene["emissivity"].sel(band=curve.band).values
+        signals = (_blackbody(curve, film) for film in (scene["object_temperature"], background))
+        clean = mixing.leaving(emissivity, *signals)
+        noise = float(response["noise"].sel(band=curve.band))
         movie[index] = clean + rng.normal(0.0, noise, clean.shape)
     attrs = {"origin": "simulated"}
     attrs |= {"twin": scene.attrs["twin"]} if "twin" in scene.attrs else {}
     coords = {"band": names, **{name: scene[name] for name in ("time", "y", "x")}}
     variables = schema.variables("corrected", {"counts": movie})
-    return schema.check(xr.Dataset(variables, coords, attrs), "corrected")
+    return schema.check_corrected(xr.Dataset(variables, coords, attrs))
 
 
 def pattern(rig: Rig, shape: tuple[int, int], rng: Randomness) -> xr.Dataset:
@@ -401,7 +406,9 @@ def pattern(rig: Rig, shape: tuple[int, int], rng: Randomness) -> xr.Dataset:
         relative to the mean of the live pixels, a smooth vignette (narcissus) included; `dead`
         (band, y, x).
     """
-    size, rng = (len(rig.bands), *shape), np.random.default_rng(rng)
+    schema.require(rig, Rig, "rig")
+    shape, rng = _image(shape), _generator(rng)
+    size = (len(rig.bands), *shape)
     rows, columns = np.meshgrid(*(np.linspace(-1, 1, n) for n in shape), indexing="ij")
     # Random gains and offsets with a vignette, relative to the live pixels.
     vignette = rows**2 + columns**2
@@ -421,7 +428,8 @@ def pattern(rig: Rig, shape: tuple[int, int], rng: Randomness) -> xr.Dataset:
 def capture(corrected: xr.Dataset, detector: xr.Dataset) -> xr.Dataset:
     """Raw 16-bit counts: fixed pattern, dead pixels and rounding added to corrected counts.
 
-    TypeError or ValueError if the detector lacks a band, or a count does not fit into 16 bits.
+    TypeError or ValueError if the counts are raw, the detector lacks a band or a map, or a count
+    does not fit into 16 bits.
 
     Parameters
     ----------
@@ -439,7 +447,7 @@ def capture(corrected: xr.Dataset, detector: xr.Dataset) -> xr.Dataset:
     >>> raw["counts"].dtype.name, round(float((raw["counts"] == 0).mean()), 1)  # dead pixels
     ('uint16', 0.1)
     """
-    schema.check(corrected, "corrected")
+    schema.check_corrected(corrected)
     detector = schema.laid_on(detector, corrected, "the detector", "the counts")
     counts = np.empty(corrected["counts"].shape, dtype=np.uint16)
     for index, movie in enumerate(corrected["counts"]):
@@ -473,14 +481,18 @@ def blackbody_movies(
     >>> (rise / 20.0).values.round().tolist()  # count/K in each band
     [108.0, 11.0]
     """
-    response, rng = rig.response(), np.random.default_rng(rng)
-    shape = (_numbers.whole_number("frames", frames, (1, 2**31)), *detector["gain"].shape[1:])
-    level = xr.DataArray(temperatures, dims="temperature", name="temperature")
+    schema.require(rig, Rig, "rig")
+    response, rng = rig.response(), _generator(rng)
+    temperatures = schema.rising_numbers(temperatures, "temperatures", "K", least=1)
+    patterns = [_of_band(detector, name) for name in rig.bands]
+    _numbers.whole_number("number of frames", frames, (1, 2**31))
+    shape = (frames, *patterns[0]["gain"].shape)
     movies = np.empty((len(rig.bands), len(temperatures), *shape), dtype=np.uint16)
-    for index, counts in enumerate(_blackbody(response, level)):
-        noise, of_band = float(response["noise"][index]), _of_band(detector, rig.bands[index])
-        for place, mean in enumerate(counts):
-            movies[index, place] = digitise(mean + rng.normal(0.0, noise, shape), of_band)
+    for index, curve in enumerate(responses.curves(response, rig.bands)):
+        noise = float(response["noise"][index])
+        levels = curve.counts(responses.require_range(temperatures, curve, "temperature"))
+        for place, mean in enumerate(levels):
+            movies[index, place] = digitise(mean + rng.normal(0.0, noise, shape), patterns[index])
     coords = {"band": list(rig.bands), "temperature": ("temperature", temperatures, {"units": "K"})}
     variables = schema.variables("blackbody_movies", {"counts": movies})
     return xr.Dataset(variables, coords, {"origin": "simulated"})
@@ -497,15 +509,15 @@ def digitise(counts: np.ndarray, detector: xr.Dataset) -> np.ndarray:
         The `pattern` (y, x) of this band.
     """
     raw = np.rint(detector["gain"].values * counts + detector["offset"].values)
-    if not (raw.min() >= 0 and raw.max() <= correction.DETECTOR_MAXIMUM):  # a NaN fails it, too
-        message = f"Invalid counts {raw.min()} to {raw.max()} in band '{detector['band'].item()}'"
-        raise ValueError(f"{message}. Must lie in [0, {correction.DETECTOR_MAXIMUM}].")
+    name = f"counts in band '{detector['band'].item()}'"
+    _numbers.real_numbers(name, raw, (0, correction.DETECTOR_MAXIMUM))
     return np.where(detector["dead"].values, 0, raw).astype(np.uint16)
 
 
 def _of_band(detector: xr.Dataset, band: str) -> xr.Dataset:
     """Pattern (y, x) of one band."""
+    schema.check(detector, "correction", ("gain", "offset"), "the detector")
     schema.band_positions(detector, [band], "the detector")
-    dead = schema.OPTIONAL["correction"]["bad"]  # a map of other bands would be filled with NaN
-    schema.check_variable(detector["dead"], dead, "'dead' of the detector")
+    dead: Any = detector.get("dead")  # a map of other bands would be filled with NaN
+    schema.check_variable(dead, schema.OPTIONAL["correction"]["bad"], "'dead' of the detector")
     return detector.sel(band=band)

@@ -6,7 +6,8 @@ By the supplement of Narayanan et al. (2026), doi:10.48550/arXiv.2509.11334.
 import numpy as np
 import xarray as xr
 
-from dbthermal import _numbers, mixing, planck, schema
+from dbthermal import _numbers, mixing, schema
+from dbthermal._numbers import POSITIVE, real_numbers
 from dbthermal.emissivity import CAMERA_BAND
 
 _NUMBERS = schema.Variable(("material", "first", "second"), "float64", "1", "condition number")
@@ -101,7 +102,7 @@ def _single_frame_std(table: xr.Dataset, noise: xr.DataArray, camera_band: str) 
     names = [str(name) for name in values["band"].values]
     if camera_band not in names or len(names) < 2:
         raise ValueError(f"Invalid bands {names}. Must hold '{camera_band}' and at least one more.")
-    std = planck.require_positive("noise [K]", schema.band_values(noise, names, "the noise", "K"))
+    std = real_numbers("noise [K]", schema.band_values(noise, names, "the noise", "K"), POSITIVE)
     filters = [name for name in names if name != camera_band]
     camera, filtered = (values.sel(band=it).values for it in ([camera_band], filters))
     noises = std[names.index(camera_band)], std[[names.index(name) for name in filters]]

@@ -21,7 +21,7 @@ from scipy.constants import Stefan_Boltzmann
 from scipy.sparse.linalg import splu
 
 from dbthermal._arrays import Array
-from dbthermal.planck import require_positive
+from dbthermal._numbers import POSITIVE, real_numbers
 
 Varying: TypeAlias = float | Array | Callable[[float], float | Array]
 """A number, one for each vertex (vertex,), or a function of time [s] that returns either."""
@@ -134,7 +134,7 @@ class Solid:
     def __post_init__(self) -> None:
         """Refuse a property that is not finite and positive."""
         for field in fields(self):
-            require_positive(f"{field.name} of a solid", getattr(self, field.name))
+            real_numbers(f"{field.name} of a solid", getattr(self, field.name), POSITIVE)
 
 
 # At 300 K, from table A.3 of Bergman, Lavine, Incropera, DeWitt (2011), Fundamentals of Heat and
@@ -170,7 +170,7 @@ class Shell:
 
     def __post_init__(self) -> None:
         """Check thickness and mesh."""
-        require_positive("thickness [m] of a shell", self.thickness)
+        real_numbers("thickness [m] of a shell", self.thickness, POSITIVE)
         mesh = self.mesh
         if mesh.is_empty:
             raise ValueError("Empty mesh of a shell. Must have a face.")
@@ -263,10 +263,10 @@ def simulate(
        Journal on Numerical Analysis 14(6), doi:10.1137/0714068
     """
     times = _times(time)
-    limit = np.inf if step is None else float(require_positive("step [s]", step))
+    limit = np.inf if step is None else float(real_numbers("step [s]", step, POSITIVE))
     temperature = _initial(initial, len(shell.area))
     stepper = _Stepper(shell, exchanges, temperature, times[0])
-    stepper.tolerance = float(require_positive("tolerance [K]", tolerance))
+    stepper.tolerance = float(real_numbers("tolerance [K]", tolerance, POSITIVE))
     result = np.empty((times.size, temperature.size))
     result[0] = temperature
     for index in range(1, times.size):
@@ -379,5 +379,5 @@ def _initial(initial: npt.ArrayLike, vertices: int) -> Array:
     if array.shape not in {(), (vertices,)}:
         label = f"Invalid shape {array.shape} of the initial temperature"
         raise ValueError(f"{label}. Must be a number or ({vertices},).")
-    require_positive("initial temperature", array)
+    real_numbers("initial temperature", array, POSITIVE)
     return np.array(np.broadcast_to(array, (vertices,)))

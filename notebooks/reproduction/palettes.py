@@ -26,7 +26,7 @@ from dbthermal import _text as texts
 from dbthermal import schema
 from dbthermal._arrays import Array
 from dbthermal._compiled import compiled
-from dbthermal.planck import require_positive
+from dbthermal._numbers import POSITIVE, real_numbers
 
 MEMORY: Final = 2.0**30  # largest memory that a video may take, by default [byte]
 PIXEL: Final = 9  # memory of a pixel: number of its colour, position in the palette, mask [byte]
@@ -45,7 +45,7 @@ Film = tuple[NDArray[np.uint32], Array]
 
 def _decode(path: Path, width: int | None, memory: float, sha256: str | None) -> Film:
     """Decode a video left of `width` [pixel]; see `palette_video`."""
-    require_positive("memory", memory)
+    real_numbers("memory", memory, POSITIVE)
     content = texts.regular_file(path, int(memory)).read_bytes()
     kinds = _CONTAINERS.items()
     form = next((name for name, (at, marks) in kinds if content[at : at + 4] in marks), None)

@@ -63,7 +63,7 @@ def test_finds_a_smooth_field() -> None:
     capture["counts"][:, :, 30, 40:44] = 1e6
     capture["counts"][1, 50] = np.nan
     capture["counts"][0, 70:73, 10, 10] = np.nan
-    capture["status"] = ("y", "x"), status, schema.status_attrs()
+    capture["status"] = ("y", "x"), status, schema.Status.cf_attrs(schema.STATUS)
     field = check(capture, true, 0.8, 0.03)
     assert field.attrs["reference_band"] == "8-14"
     assert field.attrs["bands"] == ["9.5"]
@@ -265,13 +265,14 @@ STILL = xr.Dataset(
     {"band": list(RIG.bands), "time": np.arange(60) / 10.0},
 ).astype(np.float32)
 DEAD = xr.DataArray(np.full((30, 32), schema.Status.DEAD_PIXEL, np.uint32), dims=("y", "x"))
+DEAD.attrs.update(schema.Status.cf_attrs(schema.STATUS))
 
 
 test_refuses_what_tells_no_shift = refused(
     lambda capture: alignment.reflection_shift(capture, RESPONSE),
     [
         (STILL, "Missing texture"),
-        (STILL.assign(status=DEAD.assign_attrs(schema.status_attrs())), "Missing texture"),
+        (STILL.assign(status=DEAD), "Missing texture"),
         (STILL.isel(band=[0]), "Must be two or more"),
         (STILL.isel(y=slice(20)), "20 rows"),
         (STILL.isel(time=slice(10)), "number 10 of frames"),

@@ -67,7 +67,7 @@ def views(matrix: np.ndarray, seed: int = 0, frames: int = 3) -> xr.Dataset:
     return xr.Dataset(
         {
             "counts": (("band", "time", "y", "x"), counts.astype(np.float32)),
-            "status": (("y", "x"), status, schema.status_attrs()),
+            "status": (("y", "x"), status, schema.Status.cf_attrs(schema.STATUS)),
         },
         coords={"band": ["8-14", "9.5"], "time": np.arange(frames) / 10.0},
     )

@@ -131,8 +131,7 @@ test_bad_counts = refused(
         (lambda it: it[:, ::-1], "Unordered 'temperature'"),
         (lambda it: it.isel(band=[0, 0]), "Repeated band"),
         (lambda it: it.drop_vars("temperature"), "Missing coordinate 'temperature'"),
-        (lambda it: at(it, -20.0, 40.0), "Invalid temperature [K] -20.0"),
-        (lambda it: at(it, 10, 70), "temperature 10.0 K of a blackbody. Must be at least 100.0 K"),
+        (lambda it: at(it, 10, 70), r"temperature \[K\] of a blackbody 10.0.*in kelvin, not"),
         (lambda it: it.values, "Invalid blackbody counts of type ndarray"),
     ],
 )

@@ -170,7 +170,7 @@ def test_an_unplugged_camera(tmp_path: Path) -> None:
 def test_a_clock_that_drifts(tmp_path: Path) -> None:
     """Stamps of a camera's own clock are kept, are no times, and are fitted on demand only."""
     recorded = CheckedRecording(tmp_path / "a.zarr", {"9.5": Faults(clock_rate=1.01)}).record(0.4)
-    with pytest.raises(ValueError, match=r"Invalid exposure times of band '9\.5': 0 stamps"):
+    with pytest.raises(ValueError, match=r"exposure times of band '9\.5' of shape \(0,\)"):
         open_capture(recorded.path)
     fitted = open_capture(recorded.path, fitted=True)["exposure_time"].sel(band="9.5")
     frames = recorded.frames["9.5"]

@@ -242,7 +242,7 @@ test_bad_scene_is_a_clear_error = refused(
     [
         (PLAIN.drop_vars("emissivity"), {}, "Missing variable 'emissivity'"),
         (PLAIN.isel(band=[0]), {}, "one band"),
-        (DOUBLED, {}, "emissivity 1.72 in band '8-14'"),
+        (DOUBLED, {}, "emissivity in band '8-14' 1.72. Must lie in (0, 1)"),
         (PLAIN.assign(object_temperature=WARM + 100), {}, "object_temperature"),
         (PLAIN.assign(object_temperature=COLD), {}, "30 smooth functions"),
         (PLAIN, {"emissivity_std": -0.1}, "emissivity_std -0.1"),
@@ -366,7 +366,7 @@ test_bad_plan_is_a_clear_error = refused(
         (limits.plan, (TABLE, NETD), {"together": 5}, "together 5"),
         (limits.plan, (TABLE, NETD), {"together": 1.0}, "Invalid together 1.0"),
         (limits.plan, (TABLE, NETD), {"design": 35}, "design of type int. Must be a CaptureDesign"),
-        (limits.plan, (MIRROR, NETD), {}, "emissivity 1.2 of 'plate window glass'"),
+        (limits.plan, (MIRROR, NETD), {}, "emissivity of 'plate window glass' in band"),
         (limits.plan, (TABLE, MUTE), {}, "noise"),
         (limits.plan_durations, (TABLE, NETD, [2.0, 1.0]), {}, "Must increase strictly"),
         (limits.CaptureDesign, (), {"duration": 6.0}, "Must"),

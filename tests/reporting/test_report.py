@@ -12,9 +12,9 @@ import pytest
 import xarray as xr
 
 import dbthermal
-from dbthermal import store
+from dbthermal import schema, store
 from dbthermal.explorer import Region
-from dbthermal.schema import Status, status_attrs
+from dbthermal.schema import Status
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
 COLORS = """() => {{
@@ -42,7 +42,7 @@ def scene(**attrs: Any) -> xr.Dataset:
         "background_temperature": (movie, np.full_like(film, 295.0)),
         "emissivity": (bands, np.broadcast_to(pair, (2, *shape)).copy()),
         "emissivity_std": (bands, np.full((2, *shape), 0.004)),
-        "status": (image, status, status_attrs()),
+        "status": (image, status, Status.cf_attrs(schema.STATUS)),
     }
     attributes = {"origin": "simulated", "method": "subspace", **attrs}
     return xr.Dataset(parts, {"time": time, "band": ["8-14", "9.5"]}, attributes)

@@ -35,7 +35,7 @@ def normal(truth: xr.Dataset, scale: float = 1.0, seed: int = 1) -> xr.Dataset:
         result[name] = truth[name] + rng.normal(0.0, std, truth[name].shape)
         result[f"{name}_std"] = xr.full_like(truth[name], scale * std)
     empty = np.zeros((1, truth.sizes["x"]), dtype=np.uint16)
-    return result.assign(status=(("y", "x"), empty, schema.status_attrs()))
+    return result.assign(status=(("y", "x"), empty, schema.Status.cf_attrs(schema.STATUS)))
 
 
 def flagged(result: xr.Dataset, pixels: Mapping[str, slice]) -> xr.Dataset:

@@ -185,7 +185,7 @@ def filled(
         number = np.concatenate(list(counts))
     variable = schema.OPTIONAL["separated"]["bridged"]
     result["bridged"] = (variable.dims, lacking, variable.attrs)
-    result["status"].attrs.update(schema.status_attrs())
+    result["status"].attrs.update(Status.cf_attrs(schema.STATUS))
     curve = inputs.curves[inputs.bands[0]]
     return added(result, inputs).assign_attrs(
         frames_missing=int(np.count_nonzero(~frames)),

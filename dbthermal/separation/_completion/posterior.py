@@ -26,7 +26,7 @@ from typing import Final
 import numpy as np
 import xarray as xr
 
-from dbthermal import emissivity, schema
+from dbthermal import _numbers, _text, emissivity, schema
 from dbthermal._compiled import compiled
 from dbthermal._smooth import largest
 from dbthermal.separation import _frames as frames
@@ -80,24 +80,17 @@ class Mixture:
             return cls(table["weight"].values, *arrays)
         if isinstance(prior, str):
             materials = emissivity.embedded_table()["emissivity"]
-            if prior not in materials["material"]:
-                names = materials["material"].values.tolist()
-                raise ValueError(f"Unknown prior '{prior}'. Must be one of {names}.")
+            _text.check_listed("Unknown prior", prior, materials["material"].values.tolist())
             prior = materials.sel(material=prior)
         stds = np.full(len(bands), _SAMPLE_STD)
         if isinstance(prior, xr.Dataset):
             if missing := {"emissivity", "emissivity_std"} - set(prior):
-                raise ValueError(
-                    f"Missing variable '{min(missing)}' in the prior. Has {list(prior)}."
-                )
+                raise ValueError(f"Missing '{min(missing)}' in prior {[*prior]}. Must be there.")
             prior, std = prior["emissivity"], prior["emissivity_std"]
             stds = schema.band_values(std, bands, "emissivity_std of the prior", "1")
         values = schema.band_values(prior, bands, "prior", "1")
-        for name, numbers in (("emissivities", values), ("emissivity_std", stds)):
-            if not np.all((numbers > 0) & (numbers < 1)):
-                raise ValueError(
-                    f"Invalid {name} {numbers.tolist()} of the prior. Must lie in (0, 1)."
-                )
+        for name, numbers in (("emissivity", values), ("emissivity_std", stds)):
+            _numbers.real_numbers(f"{name} of the prior", numbers, _numbers.FRACTION)
         return cls(np.ones(1), values[None, :, None], np.diag(stds**2)[None, ..., None])
 
     def grid(self) -> Array:

@@ -242,8 +242,7 @@ def _checked(
     """Result in the capture's order of bands."""
     schema.check_corrected(corrected)
     for name, value in (("error_rate", error_rate), ("resolution", resolution)):
-        if not 0 < _numbers.real_number(name, value) < 1:
-            raise ValueError(f"Invalid {name} {value}. Must lie in (0, 1).")
+        _numbers.real_number(name, value, _numbers.FRACTION)
     names = [name for name in schema.STAGES["separated"] if name in _NEEDED or name in result]
     schema.check(result, "separated", names, "the result")
     if "reflection_ratio" in result.attrs.get("not_estimated", "").split():

@@ -24,7 +24,7 @@ from typing import Final
 import numpy as np
 from scipy.ndimage import maximum_filter, uniform_filter
 
-from dbthermal import planck
+from dbthermal._numbers import POSITIVE, real_numbers
 from dbthermal.response import require_range
 from dbthermal.separation import Method
 from dbthermal.separation._inputs import check_fields
@@ -54,7 +54,7 @@ class BcpSettings:
         for name in ("patch", "window"):
             side = getattr(self, name)
             require(self, "bcp", name, side >= 1 and side % 2 == 1, "be odd")
-        planck.require_positive("regularisation of method 'bcp'", self.regularisation)
+        real_numbers("regularisation of method 'bcp'", self.regularisation, POSITIVE)
         require(self, "bcp", "percentile", 0 <= self.percentile <= 100, "lie in [0, 100]")
         least = self.least_transmission
         require(self, "bcp", "least_transmission", 0 < least <= 1, "lie in (0, 1]")

@@ -18,7 +18,8 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from dbthermal import mixing, planck
+from dbthermal import mixing
+from dbthermal._numbers import POSITIVE, real_numbers
 from dbthermal.schema import Status
 from dbthermal.separation import Method
 from dbthermal.separation import _calibrated as calibrated
@@ -88,7 +89,7 @@ class DbvtSettings:
                 require(self, "dbvt", name, holds, f"be at least {least}")
         positive = ("curvature", "huber_threshold", "deviation_floor")
         for name in (*positive, "first_share", "tolerance", "largest_step"):
-            planck.require_positive(f"{name} of method 'dbvt'", getattr(self, name))
+            real_numbers(f"{name} of method 'dbvt'", getattr(self, name), POSITIVE)
         require(self, "dbvt", "margin", 0 < self.margin < 0.5, "lie in (0, 0.5)")
 
 

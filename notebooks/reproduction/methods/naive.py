@@ -19,7 +19,8 @@ from typing import Any, Final
 import numpy as np
 from scipy.special import expit, logit
 
-from dbthermal import mixing, planck
+from dbthermal import mixing
+from dbthermal._numbers import POSITIVE, real_numbers
 from dbthermal.schema import Status
 from dbthermal.separation import Method
 from dbthermal.separation._inputs import check_fields
@@ -63,8 +64,8 @@ class NaiveSettings:
         check_fields(self, "naive")
         for name in ("starts", "iterations"):
             require(self, "naive", name, getattr(self, name) >= 1, "be at least 1")
-        planck.require_positive("shift_std [K] of method 'naive'", self.shift_std)
-        planck.require_positive("tolerance of method 'naive'", self.tolerance)
+        real_numbers("shift_std [K] of method 'naive'", self.shift_std, POSITIVE)
+        real_numbers("tolerance of method 'naive'", self.tolerance, POSITIVE)
 
 
 @dataclass(frozen=True)

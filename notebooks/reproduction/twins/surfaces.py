@@ -15,7 +15,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
 from dbthermal._arrays import Array
-from dbthermal.planck import require_positive
+from dbthermal._numbers import POSITIVE, real_numbers
 from reproduction.twins.rays import unit
 
 Profile = tuple[tuple[float, float], ...]
@@ -172,7 +172,7 @@ def moved(
 
 def _pieces(length: float, spacing: float) -> int:
     """Number of equal pieces of at most the spacing in a length; 1e-9 forgives rounding."""
-    require_positive("length and spacing [m]", (length, spacing))
+    real_numbers("length and spacing [m]", (length, spacing), POSITIVE)
     return max(1, int(np.ceil(length / spacing - 1e-9)))
 
 
