@@ -23,6 +23,7 @@ from dbthermal import (
     limits,
     mixing,
     noise,
+    planck,
     readers,
     response,
     separation,
@@ -34,6 +35,7 @@ from dbthermal.scene import separate_capture
 from dbthermal.schema import Status, laid_on
 from reproduction import figures as drawings
 from reproduction.experiments.twins import reflected_change
+from reproduction.figures.scenes import truth_and_estimate
 from reproduction.filters import rank_filters
 from reproduction.methods.dbvt import DbvtSettings
 
@@ -75,6 +77,8 @@ calibrated = partial(solve, method="calibrated")
 walked = partial(simulation.walkers, TIME, SHAPE, GLASS, RNG)
 fitted = partial(calibration.fit_response, CAMERA["counts"])
 completed = partial(separation.complete, RESULT, CAPTURE, CAMERA)
+grouped: Callable[..., Any] = partial(separation.materials, corrected=CAPTURE, response=CAMERA)
+aligned: Callable[..., Any] = partial(alignment.align, CAPTURE)
 Call = Callable[[], Any]
 Labelled = xr.DataArray | xr.Dataset
 
@@ -140,6 +144,8 @@ FLAT = 20000.0 * xr.ones_like(MAPS)
 PLAIN = xr.Dataset({"gain": xr.ones_like(MAPS), "offset": 0.0 * MAPS, "bad": MAPS < 0})
 EVEN = CAPTURE.assign(counts=COUNTS.round().astype(np.uint16))
 CELSIUS = units(OBJECT, "degC")
+DARK = correction.Reference(CAMERA, TWICE & False, (300.0, 310.0))
+correcting: Callable[..., Any] = partial(correction.correct_capture, EVEN, PLAIN)
 SETTINGS: list[tuple[Any, dict[str, Any], str]] = [
     (separation.SubspaceSettings, {"background_drift": None}, "background_drift"),
     (separation.SubspaceSettings, {"background_drift": "3"}, "background_drift"),
@@ -165,10 +171,7 @@ CASES: list[tuple[Call, str]] = [
     (lambda: noise.estimate(ONE, ONE, 3.0), r"time \[s\] 3.0 of shape"),
     (lambda: separation.without_calibration(RESULT, drift=cast(Any, "no")), "drift 'no'"),
     (lambda: walked(crossings=cast(Any, "7")), "crossings '7'"),
-    (
-        lambda: simulation.blackbody_movies(RIG, np.array([280.0]), cast(Any, 1.5), DETECTOR, RNG),
-        "frames 1.5",
-    ),
+    (lambda: simulation.blackbody_movies(RIG, TIME + 280, cast(Any, 1.5), DETECTOR, RNG), "s 1.5"),
     (lambda: figures.status(RESULT.astype(float)), "'status' of the result.*mask, average or fill"),
     (lambda: figures.reflection_shift(RESULT), "Missing variable 'shift' in the field"),
     (lambda: rows(frames=APPARENT[0]), r"Invalid dims \('time', 'y', 'x'\) of the inputs"),
@@ -176,14 +179,28 @@ CASES: list[tuple[Call, str]] = [
     (lambda: store.provenance(cast(Any, [1])), "Invalid parameters of type list"),
     (lambda: store.save(CAPTURE, "a.zarr", {"a": np.nan}), "Invalid parameter 'provenance'"),
     (lambda: paired(NOTHING, STILL), "Invalid recording of band '8-14' of type NoneType"),
-    (
-        lambda: alignment.align(CAPTURE, offset=cast(Any, [0, 1])),
-        "DataArray .band., 0 in the first",
-    ),
+    (lambda: aligned(offset=[0, 1]), "DataArray .band., 0 in the first"),
     (lambda: limits.plan(TABLE.sel(band=["8-14"]), NOISE), "Missing band '8-14', or a second one"),
     (lambda: simulation.Background(level=22.0), r"level \[K\] 22.0.*in kelvin"),
     (lambda: simulation.Background(drift=np.nan), "drift"),
-    (lambda: simulation.Rig(offset=np.nan), "offset"),
+    (lambda: planck.spectral_radiance(10.0, 300.0), r"wavelength \[m\] 10.0.*not in micrometres"),
+    (lambda: planck.spectral_radiance(1e-5, [[9.0], [9.0, 9.0]]), "list. Must be numbers in equal"),
+    (lambda: planck.spectral_radiance(1e-5, cast(Any, CAPTURE)), "temperature .K. of type Dataset"),
+    (lambda: simulation.Rig(noise=(30.0, 350.0)), r"noise \[K\] 30.0.*not in millikelvin"),
+    (lambda: simulation.Rig(lowest=-10.0), r"range \[K\] -10.0.*in kelvin"),
+    (lambda: simulation.heating(TIME, cast(Any, "a"), 300.0, 9.0), r"start and stop \[K\] 'a'"),
+    (lambda: simulation.walkers(TIME, cast(Any, 4), GLASS, 1), r"shape 4 of shape \(\). Must have"),
+    (lambda: simulation.walkers(TIME, SHAPE, GLASS, cast(Any, "1")), "rng '1'. Must be a Gener"),
+    (lambda: simulation.walkers(TIME, SHAPE, MAPS[:, 1:], 1), r"\(2, 5, 8\). Must have \(2, 6, 8"),
+    (lambda: simulation.side_by_side(TABLE["emissivity"], cast(Any, (4.0, 4.0))), "shape 4.0.*who"),
+    (lambda: simulation.scene(TIME, ONE, ONE, GLASS), r"\(60, 3\). Must have \(60, 3, 1\)"),
+    (lambda: simulation.pattern(cast(Any, SHAPE), SHAPE, RNG), "Invalid rig of type tuple"),
+    (lambda: simulation.capture(RAW, DETECTOR), "dtype uint16 .* raw counts"),
+    (lambda: simulation.capture(CAPTURE, DETECTOR.drop_vars("gain")), "Missing variable 'gain' in"),
+    (lambda: simulation.observe(SCENE, CAMERA, RNG, "int16"), "dtype int16 of 'counts'"),
+    (lambda: limits.plan(TABLE, 1e3 * NOISE), r"noise \[K\] in band '8-14' .*not in millikelvin"),
+    (lambda: figures.plan(TABLE, TABLE, ["gold"]), "Unknown material 'gold'. Must be one of"),
+    (lambda: correcting(reference=3.0), "Invalid reference of type float"),
     (lambda: completed(surroundings=295.0, surroundings_std=True), "surroundings_std"),
     (lambda: completed(surroundings_std=1e-30), "surroundings_std"),
     (lambda: separation.separate(EMPTY, CAMERA, surroundings_std=1e-30), "surroundings_std"),
@@ -208,13 +225,13 @@ CASES: list[tuple[Call, str]] = [
     (lambda: mixing.condition_number(0.9), "two bands"),
     (lambda: noise.estimate(ONE.astype(complex), ONE, TIME), "signal"),
     (lambda: noise.second_difference(ONE[:4], [0.0, 1.0, 1.0, 2.0]), "Must increase strictly"),
-    (lambda: alignment.align(CAPTURE, offset=0.0, reflection_shift=cast(Any, 3)), "shift"),
+    (lambda: aligned(offset=0.0, reflection_shift=3), "shift"),
     (lambda: alignment.align(RAW, offset=0.0), "correct_capture, of a camera that corrects itself"),
     (lambda: correction.correct_capture(RAW, CORRECTION, shutter=NOTHING), "shutter"),
     (lambda: correction.correct_capture(RAW, NOTHING), "Invalid correction of type NoneType"),
     (lambda: correction.correct_capture(NOTHING, CORRECTION), "Invalid capture of type NoneType"),
     (lambda: whole(target="all.nc"), r"Must end in '\.zarr'"),
-    (lambda: whole(correcting=None), "correct_capture.*mapping"),
+    (lambda: whole(correcting=None), "correct_capture.*Mapping"),
     (lambda: whole(aligning={"ofset": 0.0}), "ofset.*offset"),
     (lambda: store.open_dataset(NOTHING), "path"),
     (lambda: readers.flir(NOTHING), "path"),
@@ -230,7 +247,6 @@ CASES: list[tuple[Call, str]] = [
     (lambda: separation.solve(RAW, CAMERA), "correct_capture.*correction.corrected_by"),
     (lambda: solve("magic"), r"Unknown method 'magic'. Must be one of \['subspace', 'calibrated'"),
     (lambda: solve(response_kind="cubic"), "Unknown kind of response 'cubic'"),
-    (lambda: solve(workers=0), "Invalid number of workers 0"),
     (lambda: separation.solve(CAPTURE.isel(band=[0]), CAMERA), "Must be two or more"),
     (lambda: separation.solve(TURNED, CAMERA), r"dims \('time', 'band', 'y', 'x'\) of 'counts'"),
     (lambda: separation.solve(FALLING, CAMERA), "'time' of 'counts' .*: 3.9 s is followed by 3.9"),
@@ -279,7 +295,7 @@ CASES: list[tuple[Call, str]] = [
     (displaced(lambda it: it.assign(shift_std=it["shift_std"] - 1.0)), "Invalid shift_std"),
     (displaced(lambda it: it.assign(shift=it["shift"] + 30.0)), "shift of 30 pixel. Must be less"),
     (displaced(lambda it: it.drop_vars("known")), "Missing variable 'known' in the reflection_sh"),
-    (lambda: completed(prior=emissivity_of(1.2, 0.9)), r"emissivities \[1.2, 0.9\] of the prior"),
+    (lambda: completed(prior=emissivity_of(1.2, 0.9)), "emissivity of the prior 1.2. Must lie in"),
     (lambda: completed(prior="glas"), "Unknown prior 'glas'"),
     (lambda: completed(surroundings=22.0), r"\[K\] 22.0.* not in degrees Celsius"),
     (lambda: completed(surroundings=2e4), r"surroundings \[K\] 20000.0. Must lie in"),
@@ -287,25 +303,14 @@ CASES: list[tuple[Call, str]] = [
     (lambda: completed(surroundings=295.0, surroundings_std=0.0), r"surroundings_std \[K\] 0.0"),
     (lambda: completed(workers=0), "number of workers 0. Must be a whole number, at least 1"),
     (lambda: completed(LABELS[:3]), "Invalid size 3 of"),
-    (lambda: separation.materials(RESULT, CAPTURE, CAMERA, error_rate=0.0), r"error_rate 0\.0"),
-    (lambda: separation.materials(RESULT, CAPTURE, CAMERA, resolution=1.5), r"resolution 1\.5"),
-    (
-        lambda: separation.materials(RESULT.drop_vars("reflection_ratio"), CAPTURE, CAMERA),
-        "Missing variable 'reflection_ratio' in the",
-    ),
-    (
-        lambda: separation.materials(RESULT.isel(band=[1]), CAPTURE, CAMERA),
-        r"Missing band '8-14' in the result, of \['9.5'\]. Must be there",
-    ),
+    (lambda: grouped(RESULT, error_rate=0.0), r"error_rate 0\.0"),
+    (lambda: grouped(RESULT, resolution=1.5), r"resolution 1\.5"),
+    (lambda: grouped(RESULT.drop_vars("reflection_ratio")), "Missing variable 'reflection_ratio'"),
+    (lambda: grouped(RESULT.isel(band=[1])), r"Missing band '8-14' in the result, of \['9.5'\]."),
     (lambda: separation.materials(RESULT, TURNED, CAMERA), "Invalid dims"),
     (lambda: correction.Reference(CAMERA, TWICE, (300.0, 300.0)), "Must differ"),
     (lambda: correction.Reference(CAMERA, TWICE, (300.0,)), r"temperatures \[K\]"),
-    (
-        lambda: correction.correct_capture(
-            EVEN, PLAIN, reference=correction.Reference(CAMERA, TWICE & False, (300.0, 310.0))
-        ),
-        "Invalid patch 0",
-    ),
+    (lambda: correcting(reference=DARK), "Invalid patch 0"),
     (lambda: reflected_change(APPARENT.isel(band=[1, 0]), RESULT), r"first band '9\.5'. Must be '"),
     (
         lambda: figures.separated_temperatures(APPARENT, CELSIUS, CHANGE, title="a"),
@@ -313,9 +318,7 @@ CASES: list[tuple[Call, str]] = [
     ),
     (lambda: film(CELSIUS), "Invalid units 'degC' of the emission"),
     (
-        lambda: drawings.scenes.truth_and_estimate(
-            SCENE, RESULT.assign(object_temperature=CELSIUS), (1, 1)
-        ),
+        lambda: truth_and_estimate(SCENE, RESULT.assign(object_temperature=CELSIUS), (1, 1)),
         "Invalid units 'degC' of 'object_temperature' of the result",
     ),
 ]
@@ -365,39 +368,23 @@ LAID: dict[str, tuple[Callable[[Any], Any], Labelled, str]] = {
     ),
     "solve reflection_shift": (lambda it: solve(reflection_shift=it), FIELD, "y x"),
     "solve response": (lambda it: separation.solve(CAPTURE, it), CAMERA, "band"),
-    "materials": (lambda it: separation.materials(it, CAPTURE, CAMERA), RESULT, "time y x band"),
+    "materials": (grouped, RESULT, "time y x band"),
     "reflected_change": (lambda it: reflected_change(it, RESULT), APPARENT, "time y x"),
     "apparent": (lambda it: response.apparent_temperature(it, COUNTS), CAMERA, "band"),
     "fit_response": (fitted, CAMERA["noise"], "band"),
     "correct": (lambda it: correction.correct(EVEN, it), PLAIN, "y x band"),
     "renew_offset": (lambda it: correction.renew_offset(PLAIN, it), FLAT, "y x band"),
-    "correct_capture flat": (
-        lambda it: correction.correct_capture(EVEN, PLAIN, flat=it),
-        FLAT,
-        "y x band",
-    ),
-    "correct_capture drift_reference": (
-        lambda it: correction.correct_capture(EVEN, PLAIN, drift_reference=it),
-        PIXELS,
-        "y x",
-    ),
+    "correct_capture flat": (lambda it: correcting(flat=it), FLAT, "y x band"),
+    "correct_capture drift_reference": (lambda it: correcting(drift_reference=it), PIXELS, "y x"),
     "undo_drift": (lambda it: correction.undo_drift(CAPTURE, it), PIXELS, "y x"),
     "undo_lag": (lambda it: correction.undo_lag(CAPTURE, 0.01 + 0.01 * it), STEPS, "band"),
     "find_shutter": (lambda it: correction.find_shutter(CAPTURE, closed=it), CLOSED, "time"),
-    "align offset": (lambda it: alignment.align(CAPTURE, offset=it), STEPS, "band"),
-    "align transform": (
-        lambda it: alignment.align(CAPTURE, offset=0.0, transform=it),
-        TRANSFORM,
-        "band",
-    ),
+    "align offset": (lambda it: aligned(offset=it), STEPS, "band"),
+    "align transform": (lambda it: aligned(offset=0.0, transform=it), TRANSFORM, "band"),
     "bounds": (lambda it: limits.bounds(SCENE.isel(y=[0]), it), CAMERA, "band"),
     "plan": (lambda it: limits.plan(TABLE.isel(material=[0]), it), NOISE, "band"),
     "rank_filters": (lambda it: rank_filters(TABLE, it), NOISE, "band"),
-    "truth_and_estimate": (
-        lambda it: drawings.scenes.truth_and_estimate(it, RESULT, (1, 1)),
-        SCENE,
-        "y x",
-    ),
+    "truth_and_estimate": (lambda it: truth_and_estimate(it, RESULT, (1, 1)), SCENE, "y x"),
     "separated_frames emission": (lambda it: rows(emission=it), OBJECT, "time y x"),
     "separated_frames reflection": (lambda it: rows(change=it), CHANGE, "time y x"),
     "separated_film emission": (lambda it: film(emission=it), OBJECT, "time y x"),

@@ -7,6 +7,7 @@ measurement becomes NaN or is flagged, never filled. `alignment` follows, then `
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import NoneType
 from typing import Any
 
 import numpy as np
@@ -168,6 +169,7 @@ def correct_capture(  # noqa: PLR0913 - the options of each step, by name
     schema.check(capture, "capture")
     schema.check(correction, "correction")
     _numbers.truth_value("shutter", shutter)
+    schema.require(reference, (Reference, NoneType), "reference")
     # Steps 1 and 2: distinct frames, shutter events, new offsets.
     before = correction if flat is None else renew_offset(correction, flat)
     maximum = int(correction.attrs.get("detector_maximum", DETECTOR_MAXIMUM))

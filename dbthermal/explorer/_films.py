@@ -1,6 +1,5 @@
 """Films, maps and regions of a view, read frame by frame from memory, a store, or a computation."""
 
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -193,18 +192,15 @@ class Region:
 
     def __post_init__(self) -> None:
         _text.check_listed("Unknown kind of region", self.kind, _LEAST)
-        try:
-            points = tuple((float(row), float(column)) for row, column in self.points)
-        except (TypeError, ValueError) as error:
+        points = _numbers.real_numbers(f"points of a {self.kind}", self.points, _numbers.FINITE)
+        if points.shape[1:] != (2,):
             label = f"Invalid points {self.points!r} of a {self.kind}"
-            raise ValueError(f"{label}. Must be pairs (row, column).") from error
+            raise ValueError(f"{label}. Must be pairs (row, column).")
         least, limit = _LEAST[self.kind]
         if not least <= len(points) <= max(least, limit):
             count = least if self.kind != "polygon" else f"{least} to {limit}"
             raise ValueError(f"Invalid {len(points)} points of a {self.kind}. Must be {count}.")
-        if not all(math.isfinite(value) for point in points for value in point):
-            raise ValueError(f"Invalid points {points} of a {self.kind}. Must be finite.")
-        object.__setattr__(self, "points", points)
+        object.__setattr__(self, "points", tuple(map(tuple, points.tolist())))
 
     def mask(self, shape: tuple[int, int]) -> Mask:
         """Mask (y, x) of the pixels of an image of so many rows and columns."""

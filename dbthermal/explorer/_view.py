@@ -296,6 +296,9 @@ class View:
 
     def probe(self, names: Sequence[str], index: int, row: int, column: int) -> dict[str, Any]:
         """Values of some panes at a pixel and frame, with deviations, and its flags by name."""
+        sizes = {"frame": self.time.size, "row": self.shape[0], "column": self.shape[1]}
+        for (name, size), place in zip(sizes.items(), (index, row, column), strict=True):
+            _numbers.whole_number(name, place, (0, size - 1))
         at = (slice(index, index + 1), slice(row, row + 1), slice(column, column + 1))
 
         def number(pane: str) -> float | None:
@@ -311,6 +314,8 @@ class View:
         self, name: str, index: int, regions: Mapping[str, Region], pixels: Pixels = "unflagged"
     ) -> str:
         """Python that gives the same frame and curves again, with the names `View` and `Region`."""
+        _text.check_listed("Unknown pane", name, self.panes)
+        _numbers.whole_number("frame", index, (0, self.time.size - 1))
         (_, first), *further = self.sources.items()
         arguments = ", ".join([first, *(f"{key}={value}" for key, value in further)])
         free = [key for key, value in self.sources.items() if key == value]

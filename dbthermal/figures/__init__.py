@@ -23,7 +23,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator, ScalarFormatter
 from scipy.constants import zero_Celsius
 
-from dbthermal import schema
+from dbthermal import _text, schema
 from dbthermal.figures import drawing
 from dbthermal.figures.drawing import band_label, canvas, draw_image, limits_of
 from dbthermal.schema import laid_on
@@ -300,8 +300,10 @@ def plan(expected: xr.Dataset, durations: xr.Dataset, materials: Sequence[str]) 
     durations : Dataset
         From `limits.plan_durations`: `object_temperature_std` (seconds, material, filter) [K].
     materials : sequence of str
-        Materials of the lines, each with its best filter; one with none is left out.
+        Materials of the lines, with the best filter of each, if any; ValueError for an unknown one.
     """
+    for material in materials:
+        _text.check_listed("Unknown material", material, expected["material"].values.tolist())
     std = expected["object_temperature_std"]
     size = (7.8 + 0.75 * std.sizes["filter"], max(4.2, 0.24 * std.sizes["material"] + 1.9))
     figure, ((map_axis, bar_axis),) = canvas(1, 2, size)
