@@ -95,11 +95,11 @@ def write(path: Path, form: str) -> Path:
     return path
 
 
-def read(path: Path, form: str) -> xr.Dataset:
-    """Recording of a form, as a user reads it."""
-    options: dict[str, Any] = {"unit": "count", "clock": 10.0}
+def read(path: Path, form: str, **selected: Any) -> xr.Dataset:
+    """Recording of a form, as a user reads it, or selected rows."""
+    options: dict[str, Any] = {"unit": "count", "clock": 10.0, **selected}
     if form in FLIR:
-        return readers.flir(path)
+        return readers.flir(path, **selected)
     if form in TIFF:
         return readers.tiff(path, **options)
     if form in SEQUENCES:

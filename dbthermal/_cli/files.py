@@ -93,29 +93,30 @@ def recording(paths: list[Path], options: Namespace, camera: int = 0) -> xr.Data
     if kind != "raw files":
         formats.refuse_text(paths[0])  # of a suffix that promises more
     stated = _arguments(reader, options, paths[0].name, camera)
-    of_reader = ""  # what the reader selects, not all at hand
-    if stated.pop("frames", None) and "rows" in options:
-        stated["frames"], of_reader = between(options, "frames"), "frames"
+    selected = {}  # by the reader, not all at hand
+    for name in {"frames", "rows"} & stated.keys():
+        if stated.pop(name) and "rows" in options:
+            stated[name] = selected[name] = between(options, name)
     several = kind in {"FLIR", "TIFF"}  # whose files make one recording together
     if len(paths) > 1 and not several:
         raise ValueError(f"Invalid list of {len(paths)} {kind}. Must be joined in a file or store.")
     with _arrays.on_disk(_room(options)):  # films that are large
         movie = reader(paths if several else paths[0], **stated)
-    if of_reader and (first := stated["frames"].start):  # times since the first frame of the files
+    if "frames" in selected and (first := stated["frames"].start):  # times since the files' first
         ends = reader(paths, **{**stated, "frames": slice(0, first + 1, first)})
         lead = ends["exposure_time"].values[1]
         movie["exposure_time"].values[:] += lead
         start = {"start": ends.attrs["start"]} if "start" in ends.attrs else {}
         movie = movie.assign_coords(time=movie["time"] + lead).assign_attrs(start)
-    movie = _selected(movie, options, paths[0], of_reader) if "rows" in options else movie
+    movie = _selected(movie, options, paths[0], *selected) if "rows" in options else movie
     return movie.assign_attrs(origin="simulated") if options.simulated else movie
 
 
-def _selected(movie: xr.Dataset, options: Namespace, path: Path, of_reader: str = "") -> xr.Dataset:
+def _selected(movie: xr.Dataset, options: Namespace, path: Path, *by_reader: str) -> xr.Dataset:
     """Selected frames and rows; ValueError if some are not in the file or store."""
     for name, dim in (("frames", "time"), ("rows", "y")):
         selected = between(options, name)
-        movie = movie if name == of_reader else movie.isel({dim: selected})
+        movie = movie if name in by_reader else movie.isel({dim: selected})
         check_all(movie.sizes[dim], options, name, f"'{path.name}'")
     return movie
 

@@ -101,6 +101,7 @@ def flir(
     path: _formats.Paths,
     *,
     frames: slice | None = None,
+    rows: slice = slice(None),
     clock: Clock | None = None,
     byte_order: str | None = None,
     memory: float = MEMORY,
@@ -127,6 +128,8 @@ def flir(
         Regular file, or the files of one camera in the order of time, such as pictures.
     frames : slice, optional
         Frames to read, not negative; of a long or damaged recording only those are looked at.
+    rows : slice, optional
+        Rows of the image to keep, as for `tiff`.
     clock : float or array_like, optional
         Frame rate of the file [Hz] or time of each selected frame [s], in place of its times; a
         warning if they differ by more than half a frame.
@@ -167,22 +170,23 @@ def flir(
         # Images, all of the form of the first.
         form = _image(*listed[0], stated)._replace(body=b"")
         stored = sum(file.stat().st_size for file in paths)
-        _recording.check_memory((len(listed), *form.shape), memory, name, stored)
-        counts = empty((len(listed), *form.shape), np.uint16)
+        shape = len(listed), *form.shape
+        counts = empty(_recording.check_memory(shape, memory, name, stored, rows), np.uint16)
         for number, listing in enumerate(listed):
             image, place = _image(*listing, stated), listing[-1]
             if image._replace(body=b"") != form:
                 unlike = f"{image.shape}, {image.codec} of {place}"
                 raise ValueError(f"Invalid image {unlike}. Must be {form.shape}, {form.codec}.")
             if image.codec == "none":
-                counts[number] = np.frombuffer(image.body, f"{image.order}u2").reshape(form.shape)
+                values: Counts = np.frombuffer(image.body, f"{image.order}u2").reshape(form.shape)
             elif image.codec == "png":
-                counts[number] = _recording.png(image.body, place)
+                values = _recording.png(image.body, place)
             else:
                 codecs = _recording.optional("imagecodecs", "recordings")
                 with _recording.damage_named(f"Damaged image in {place}", "JPEG-LS that decodes"):
                     values = codecs.jpegls_decode(image.body)
-                counts[number] = _recording.decoded(values, image.shape, place)
+                values = _recording.decoded(values, image.shape, place)
+            counts[number] = values[rows]
             release()
         seconds, same_number, attrs = _cameras(listed, timed=clock is None)
     # Byte order, flags and times.

@@ -129,19 +129,25 @@ def check_present(counts: Counts, fills: Sequence[Any], name: str) -> None:
         raise ValueError(f"Missing counts in '{name}': {[*map(float, fills)]}. Must all be there.")
 
 
-def check_memory(shape: Sequence[int], memory: float, name: str, stored: float = np.inf) -> None:
-    """Raise ValueError if counts (time, y, x) take more memory than allowed, or the file holds."""
+def check_memory(
+    shape: Sequence[int], memory: float, name: str, stored: float, rows: slice = slice(None)
+) -> tuple[int, int, int]:
+    """Shape of counts (time, y, x) of some rows; ValueError beyond the memory, or for a bomb."""
     _numbers.real_number("memory", memory, _numbers.POSITIVE)
     if len(shape) != 3 or not all(size >= 1 for size in shape):  # of dask's, NaN: unknown
         raise ValueError(f"Invalid shape {tuple(shape)} of '{name}'. Must be (time, y, x), not 0.")
     frames, height, width = map(int, shape)
-    needed = 2 * (frames + 3) * height * width  # 3 while one is decoded
-    label = f"{frames} frames of {height} x {width} pixels take {needed:.3g} bytes"
+    schema.require(rows, slice, f"rows of '{name}'")
+    if not (selected := len(range(height)[rows])):
+        raise ValueError(f"Invalid rows {rows} of '{name}'. Must be some of its {height}.")
+    needed = 2 * (frames * selected + 3 * height) * width  # 3 while one is decoded
+    label = f"{frames} frames of {selected} x {width} pixels take {needed:.3g} bytes"
     if needed > memory and not made_on_disk():
         raise ValueError(f"Invalid size of '{name}': {label}. Must be at most memory={memory:.3g}.")
-    if needed > max(SMALL, _PACKED * stored):
+    if 2 * (frames + 3) * height * width > max(SMALL, _PACKED * stored):
         rule = f"Must be at most {_PACKED} times the {stored:.3g} bytes of the file"
         raise ValueError(f"Invalid size of '{name}': {label}. {rule}.")
+    return frames, selected, width
 
 
 def check_pieces(number: int, size: int, label: str) -> None:

@@ -4,10 +4,9 @@ import json
 import logging
 import math
 import re
+from collections import Counter
 from collections.abc import Iterator
-from itertools import groupby
 from logging.handlers import QueueHandler
-from operator import attrgetter
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any, Final, NamedTuple
@@ -34,7 +33,6 @@ _CODECS.update({50000: "zstd"})
 _METADATA, _NO_DATA = 42112, 42113  # tags of GDAL
 _SCALING: Final = re.compile(r"<Item\b[^<>]{0,200}\brole=.(scale|offset).[^<>]{0,200}>([^<]*)")
 _LOSSLESS: Final = "LZW, deflate, PackBits, LZMA, Zstandard"
-_AT_ONCE: Final = 2**25  # of a span [byte]
 _TILE: Final = 2**19  # that tiles may have beyond 8 times their image [byte]
 _TEMPERATURES: Final = re.compile(  # unit of values in a description, as of ImageJ or in JSON
     r"""(?im)\b(?:v|value[ _]?)?units?["']?\s*[:=]\s*["']?(?:[0-9./]+ ?)?([cm]?K|[a-z]*kelvins?|"""
@@ -58,7 +56,12 @@ _OVER_TIME: Final = re.compile("[TZIQ]?YX")  # axes as tifffile names them; slic
 
 
 def tiff(
-    path: _formats.Paths, *, unit: str, clock: Clock | None = None, memory: float = MEMORY
+    path: _formats.Paths,
+    *,
+    unit: str,
+    clock: Clock | None = None,
+    rows: slice = slice(None),
+    memory: float = MEMORY,
 ) -> xr.Dataset:
     """Counts of a TIFF or BigTIFF stack, or of one TIFF or PNG a frame, in 16 bits.
 
@@ -80,6 +83,8 @@ def tiff(
     clock : float or array_like, optional
         Frame rate [Hz] or time of each frame [s]. At a rate, files with a frame each whose numbers,
         or dates, leave some out have gaps in time there.
+    rows : slice, optional
+        Rows of the image to keep; no others take memory.
     memory : float
         Largest memory that the counts may take [byte]; refused before it is taken.
 
@@ -114,14 +119,12 @@ def tiff(
     for page in (page for page in pages if page.shape != pages[0].shape):
         label = f"Invalid page of {page.shape} in '{page.path.name}'"
         raise ValueError(f"{label}. Must be {pages[0].shape}, as the first.")
-    shape = (sum(page.images for page in pages), *pages[0].shape)
     stored = sum(length for page in pages for _, length in page.spans)
-    _recording.check_memory(shape, memory, name, stored)
+    shape = _recording.check_memory((len(pages), *pages[0].shape), memory, name, stored, rows)
     seconds, sentences = _times(pages, clock, name)
     is_even = np.ndim(np.asarray(clock)) == 0 and np.allclose(np.diff(seconds), seconds[1:2])
     places, step = _recording.numbered(paths) if is_even else (None, 0.0)
-    groups = groupby(pages, attrgetter("path"))
-    size, *lengths = (sum(page.images for page in group) for _, group in groups)
+    size, *lengths = Counter(page.path for page in pages).values()
     if step and abs(step / (size * seconds[1]) - 1) > 0.5:  # as of times in a file
         label = f"The dates of '{name}' are {step:.3g} s apart, by clock= {size * seconds[1]:.3g} s"
         sentences.append(f"{label}. Must be the rate of recording.")
@@ -129,12 +132,10 @@ def tiff(
         spans = zip(size * places, (size, *lengths), strict=True)
         seconds = seconds[1] * np.concatenate([first + np.arange(n) for first, n in spans])
     # Pixels, from the places that the pages state.
-    counts, at = empty(shape, np.uint16), 0
-    for page in pages:
-        for values in _values(page):
-            counts.reshape(-1)[at : at + values.size] = values
-            at += values.size
-            release()
+    counts = empty(shape, np.uint16)
+    for number, page in enumerate(pages):
+        counts[number] = np.concatenate([*_values(page)]).reshape(page.shape)[rows]
+        release()
     _recording.check_byte_order(counts, name)
     _recording.check_present(counts, sorted({v for page in pages for v in page.missing}), name)
     if len({size, *lengths[:-1]}) > 1:
@@ -154,7 +155,7 @@ def tiff(
 
 def _times(pages: "list[_Page]", clock: Clock | None, name: str) -> tuple[Array, list[str]]:
     """Seconds by the clock, or else by pages or a description, which must agree; sentences."""
-    text, frames = pages[0].description, sum(page.images for page in pages)
+    text, frames = pages[0].description, len(pages)
     span = np.ptp(moments := np.array([page.moment for page in pages]))
     unit = (_TIME_UNIT.findall(text) or ["s"])[0]
     interval, rate = (float((form.findall(text) or [0])[0]) for form in (_INTERVAL, _RATE))
@@ -174,11 +175,10 @@ def _times(pages: "list[_Page]", clock: Clock | None, name: str) -> tuple[Array,
 
 
 class _Page(NamedTuple):
-    """Images in a file: shape (y, x), number, byte order, and spans (place, length) [byte]."""
+    """Image in a file: shape (y, x), byte order, and spans (place, length) [byte]."""
 
     path: Path
     shape: tuple[int, int]
-    images: int
     order: str
     spans: list[tuple[int, int]]
     missing: list[float]
@@ -199,9 +199,7 @@ def _values(page: _Page) -> Iterator[Counts]:
     across = -(-page.shape[1] // width)
     for number, (start, length) in enumerate(page.spans):
         if not page.codec and not page.tile:
-            for place in range(start, start + length, _AT_ONCE):
-                size = min(_AT_ONCE, start + length - place) // 2
-                yield np.fromfile(page.path, f"{page.order}u2", size, offset=place)
+            yield np.fromfile(page.path, f"{page.order}u2", length // 2, offset=start)
             continue
         content = np.fromfile(page.path, np.uint8, length, offset=start).tobytes()
         rest = page.shape[0] - number // across * page.rows
@@ -227,7 +225,7 @@ def _pages(path: Path) -> list[_Page]:
     if _formats.format_of(path) == "PNG":
         with path.open("rb") as stream:
             rows, columns, _ = _recording.png_size(stream.read(32), f"'{path.name}'")
-        return [_Page(path, (rows, columns), 1, ">", [(0, path.stat().st_size)], [], "png")]
+        return [_Page(path, (rows, columns), ">", [(0, path.stat().st_size)], [], "png")]
     tifffile = _recording.optional("tifffile", "recordings")
     size, pages, total = path.stat().st_size, list[_Page](), 0
     # Complaints that tifffile logs, without an error.
@@ -266,7 +264,8 @@ def _pages(path: Path) -> list[_Page]:
         if further or start + stated * length > size:
             label = f"Truncated TIFF '{path.name}': {stated} images of {length} bytes at {start}"
             raise ValueError(f"{label}. Must end within its {size}.")
-        return [pages[0]._replace(images=stated, spans=[(start, stated * length)])]
+        _recording.check_pieces(stated, size, f"images of '{path.name}'")
+        return [pages[0]._replace(spans=[(start + n * length, length)]) for n in range(stated)]
     if stated not in {0, 1, len(pages)}:  # 1 of a file to which frames were appended
         state = "Truncated" if len(pages) < stated else "Invalid"
         rule = f"Must be the {stated} that its description states, of one band"
@@ -337,7 +336,7 @@ def _page(page: Any, path: Path, order: str, number: int) -> _Page:
     about, date = (page.tags.valueof(tag) for tag in ("MicroManagerMetadata", "DateTime"))
     elapsed = about.get("ElapsedTime-ms") if isinstance(about, dict) else None
     moment = _recording.moment(str(date)) if elapsed is None else 1e-3 * float(elapsed)
-    return _Page(path, shape, 1, order, spans, _no_data(page, number), *form, moment=moment)
+    return _Page(path, shape, order, spans, _no_data(page, number), *form, moment=moment)
 
 
 def _no_data(page: Any, number: int) -> list[float]:

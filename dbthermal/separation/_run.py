@@ -22,7 +22,7 @@ from dbthermal import _numbers, schema, store
 from dbthermal import _text as texts
 from dbthermal.separation import _inputs
 from dbthermal.separation._inputs import BLOCK_ROWS, Method
-from dbthermal.separation._solve import METHODS, get_method, require_seed, solve
+from dbthermal.separation._solve import METHODS, get_method, require_whole, solve
 from dbthermal.separation._tiles import largest
 from dbthermal.store._datasets import chunks_in_turn
 from dbthermal.store._integrity import last_sums
@@ -112,7 +112,7 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
     """
     if method not in METHODS:  # a process of an executor imports it by its name
         raise ValueError(f"Unknown method {method!r} of a run. Must be one of {list(METHODS)}.")
-    require_seed(seed)
+    require_whole("seed", seed, 0)
     memory = _numbers.real_number("memory [byte]", memory, _numbers.POSITIVE)
     schema.require(provenance, Mapping, "provenance")
     options: dict[str, Any] = {"settings": settings, "mask": mask, "seed": seed}

@@ -34,7 +34,7 @@ from dbthermal.separation._pooling import materials as pooling
 from dbthermal.separation._pooling.pool import hold
 from dbthermal.separation._quality import MOST_BRIDGED
 from dbthermal.separation._reflection import as_gray, restored
-from dbthermal.separation._solve import get_method, require_workers, separated
+from dbthermal.separation._solve import get_method, require_whole, separated
 from dbthermal.separation._tiles import Material
 
 if TYPE_CHECKING:
@@ -330,7 +330,7 @@ def check_stated(
         Mixture.of_prior(prior, names)
     if surroundings is not None:
         _numbers.real_numbers("surroundings [K]", surroundings, _numbers.KELVIN)
-    require_workers(workers)
+    require_whole("number of workers", workers, 1)
     return completable
 
 

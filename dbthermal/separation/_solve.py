@@ -163,8 +163,8 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     .. [1] Narayanan, Ramanagopal, Narasimhan (2026), Dual Band Thermal Videography, CVPR;
        doi:10.48550/arXiv.2509.11334
     """
-    require_workers(workers)
-    require_seed(seed)
+    require_whole("number of workers", workers, 1)
+    require_whole("seed", seed, 0)
     options: dict[str, Any] = {"settings": settings, "mask": mask, "pool": pool, "seed": seed}
     options |= {"emissivity": emissivity, "emissivity_std": emissivity_std}
     options |= {"emissivity_covariance": emissivity_covariance, "response_kind": response_kind}
@@ -256,17 +256,10 @@ def _withhold(result: xr.Dataset) -> None:
         release()
 
 
-def require_workers(workers: Any) -> None:
-    """Refuse a number of threads that is not a whole number from 1 up."""
-    if type(workers) is bool or not isinstance(workers, int | np.integer) or workers < 1:
-        rule = "Must be a whole number, at least 1"
-        raise ValueError(f"Invalid number of workers {workers!r}. {rule}.")
-
-
-def require_seed(seed: Any) -> None:
-    """Refuse a seed that is not a whole number from 0 up."""
-    if type(seed) is bool or not isinstance(seed, int | np.integer) or seed < 0:
-        raise ValueError(f"Invalid seed {seed!r}. Must be zero or positive, a whole number.")
+def require_whole(name: str, value: Any, least: int) -> None:
+    """Refuse what is not a whole number, or less than the least that it may be."""
+    if type(value) is bool or not isinstance(value, int | np.integer) or value < least:
+        raise ValueError(f"Invalid {name} {value!r}. Must be a whole number, at least {least}.")
 
 
 def get_method(name: str | Method) -> Method:

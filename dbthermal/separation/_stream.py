@@ -19,7 +19,7 @@ from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._apart import displaced
 from dbthermal.separation._inputs import Inputs, check
 from dbthermal.separation._quality import Bits
-from dbthermal.separation._solve import require_workers, separated_dataset
+from dbthermal.separation._solve import require_whole, separated_dataset
 from dbthermal.separation._stream_kernels import Planes
 from dbthermal.separation._subspace.fused import FILMS
 from dbthermal.separation._subspace.method import METHOD, separate_smooth
@@ -120,7 +120,7 @@ class Stream:
         _numbers.real_number("frame_rate [Hz]", frame_rate, _RATES)
         for name, value in (("latency", latency), ("memory", memory), ("refresh", refresh)):
             _numbers.real_number(f"{name} [s]", value, _SECONDS)
-        require_workers(workers)
+        require_whole("number of workers", workers, 1)
         options: dict[str, Any] = {"settings": settings, "response_kind": response_kind}
         options["reflection_shift"] = reflection_shift
         options["method"] = replace(METHOD, name="stream", minimum_frames=1, any_bands=False)

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import hostile_files as hostile
 import imagecodecs
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import xarray as xr
 import zarr
 from flir_files import scene, sequence
 from hostile_files import hcc, sfmov
+from numpy.testing import assert_array_equal
 
 from dbthermal import readers
 from dbthermal.__main__ import main
@@ -127,3 +129,18 @@ def test_another_reader_is_named(tmp_path: Path) -> None:
             wrong(tmp_path / name, unit="count", clock=10.0)
     with pytest.raises(ValueError, match=r"Must be read by readers\.sequence"):
         readers.flir(tmp_path / "a.hcc")
+
+
+@pytest.mark.parametrize("form", [*hostile.FLIR, *hostile.TIFF])
+def test_rows_take_no_more_memory(tmp_path: Path, form: str) -> None:
+    """Selected rows are those of the whole image, within a memory that the image exceeds."""
+    path = hostile.write(tmp_path / f"a.{form}", form)
+    whole = hostile.read(path, form)["counts"].values
+    frames, height, width = whole.shape
+    memory = 2 * (2 * frames + 3 * height) * width
+    rows = hostile.read(path, form, rows=slice(3, 5), memory=memory)
+    assert_array_equal(rows["counts"], whole[:, 3:5])
+    with pytest.raises(ValueError, match=r"Invalid size of 'a\..* Must be at most memory="):
+        hostile.read(path, form, rows=slice(3, 6), memory=memory)
+    with pytest.raises(ValueError, match=rf"Invalid rows slice.* Must be some of its {height}"):
+        hostile.read(path, form, rows=slice(height, None))

@@ -20,7 +20,7 @@ from dbthermal.separation._completion import scene as scenes
 from dbthermal.separation._completion.scene import FILMS, MAPS, Scene, Values
 from dbthermal.separation._frames import bridge
 from dbthermal.separation._inputs import Method, check
-from dbthermal.separation._solve import require_workers, solve
+from dbthermal.separation._solve import require_whole, solve
 from dbthermal.separation._tiles import Array, Mask, Tile, Whole
 
 _BITS: Final = {
@@ -127,7 +127,7 @@ def complete(  # noqa: PLR0913 - all that is known beside the capture, by name
     >>> int(alone["object_temperature"].count()), bool(error.max() < 2.0)  # K
     (0, True)
     """
-    require_workers(workers)
+    require_whole("number of workers", workers, 1)
     scope = Beside(materials, surroundings, prior, surroundings_std, reflection_shift)
     before = _checked(result, corrected)
     completed = without_calibration(before).copy(deep=True)
