@@ -32,9 +32,9 @@ from dbthermal.separation._subspace.fused import FILMS
 
 Whole = npt.NDArray[np.intp]
 
-_BLOCK: Final = 4  # pixels along a side of what is averaged
+_BLOCK: Final = 8  # pixels along a side of what is averaged
 _WINDOWS: Final = 4  # of some rows, that tell what a frame has in common
-_AROUND: Final = 5  # blocks along a side of a neighbourhood
+_AROUND: Final = 3  # blocks along a side of a neighbourhood
 # Samples of a row of a band, beyond which rows are not read two at a time: an hour of 640 columns
 # at 30 Hz takes 4.7 GB, not 5.7.
 _LONG: Final = 2**25
@@ -152,12 +152,10 @@ def _leak(blocks: _Blocks) -> Array:
     share = quotient(cross, energy, 0.0)
     noise = remainder * (energy + freedom * reflection) / _number(blocks)
     variance = quotient(noise, energy**2, 0.0)
-    # Scatter of the events about their mean, less noise, by the weight of each.
-    total = energy.sum(axis=0)
-    weight = quotient(energy, total + 0.0 * energy, 0.0)
-    apart = share - (weight * share).sum(axis=0)
-    events = quotient(np.ones_like(total), (weight**2).sum(axis=0), 1.0)
-    scatter = (weight * (apart**2 - variance)).sum(axis=0) * quotient(events, events - 1.0, 0.0)
+    # Mean square of the events' shares, less noise, by the weight of each: also what all events
+    # have in common is no right ratio.
+    weight = quotient(energy, energy.sum(axis=0) + 0.0 * energy, 0.0)
+    scatter = (weight * (share**2 - variance)).sum(axis=0)
     doubt = np.sqrt(2.0 * ((weight * variance) ** 2).sum(axis=0))
     return np.asarray(np.sqrt(np.where(scatter > _SURE * doubt, scatter, 0.0)))
 
