@@ -278,7 +278,8 @@ def test_the_demonstration_runs_as_it_is_printed(tmp_path: Path, option: list[st
     assert result.attrs["origin"] == "simulated"  # as the stacks say by themselves
     assert store.open_dataset(folder / "response.zarr").attrs["origin"] == "simulated"
     # The answer comes first, and holds the truth: 22 to 60 degC, a third of it measured or more.
-    head = re.search(r"Object from (\S+) to (\S+) degC, typically \+- (\S+) K \(noise", texts[2])
+    answer = r"Object from (\S+) to (\S+) degC \(98 % of .*\), typically \+- (\S+) K \(noise"
+    head = re.search(answer, texts[2])
     assert head, texts[2]
     low, high, std = map(float, head.groups())
     assert abs(low - 22) < 1

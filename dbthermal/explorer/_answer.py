@@ -39,14 +39,14 @@ def answer(result: xr.Dataset, materials: xr.Dataset | None = None) -> tuple[lis
     valid = np.isfinite(film) & (measured[rows] if measured[rows].any() else True)
     sentences = list[str]()
     if valid.any():
-        low, high = np.percentile(film[valid], _RANGE) - zero_Celsius
+        low, high = (np.percentile(film[valid], _RANGE) - zero_Celsius).tolist()
         deviations = _deviations(section, valid)
-        numbers |= {"object_temperature_degC": [float(low), float(high)]}
-        numbers |= {"object_temperature_std_K": deviations}
+        numbers |= {"object_temperature_degC": [low, high], "object_temperature_std_K": deviations}
         bars = " and ".join(f"+- {value:.2g} K ({cause})" for cause, value in deviations.items())
         name = "Object" if measured.any() else "Object, completed and not measured,"
         typical = f"typically {bars}" if bars else "without a standard deviation"
-        sentences.append(f"{name} from {low:.1f} to {high:.1f} degC, {typical}.")
+        span = f"from {low:.1f} to {high:.1f} degC ({np.ptp(_RANGE):g} % of the values)"
+        sentences.append(f"{name} {span}, {typical}.")
     else:
         sentences.append("No object temperature at any pixel.")
     if result.attrs.get("surroundings_source") == "capture":

@@ -84,7 +84,7 @@ def test_the_answer_and_the_author_come_first(tmp_path: Path) -> None:
     page = (tmp_path / "scene.html").read_text("utf-8")
     head = page.partition("<h2")[0]
     assert "A. Tester, a.tif and b.tif" in head
-    assert "Object from 26.9 to 31.6 \N{DEGREE SIGN}C, typically" in head
+    assert "Object from 26.9 to 31.6 \N{DEGREE SIGN}C (98 % of the values), typically" in head
     assert "\N{PLUS-MINUS SIGN}\N{NO-BREAK SPACE}0.03 K" in head
     assert "Measured: 95% of the pixels; completed, not measured: 4%." in head
     found = numbers(page)["answer"]
