@@ -153,17 +153,18 @@ def test_a_known_colour_biases_nothing(seed: int, colour: float) -> None:
         separation.separate(capture, response(**EXACT), background_ratio=ratio)
         for ratio in (None, (colour, 0.004))
     )
-    bias = [
-        float(np.nanmean(it["object_temperature"] - truth["object_temperature"]))
-        for it in (gray, coloured)
-    ]
+    name = "object_temperature"
+    errors = [it[name] - truth[name] for it in (gray, coloured)]
+    bias = [float(error.mean()) for error in errors]
+    rms = [float((error**2).mean()) ** 0.5 for error in errors]
     off = [abs(it["emissivity"] - truth["emissivity"]).median() for it in (gray, coloured)]
-    print(colour, seed, bias, holds(gray, truth), holds(coloured, truth))
+    print(colour, seed, bias, rms, holds(gray, truth), holds(coloured, truth))
     assert bias[0] < -0.05
     assert abs(bias[1]) < 0.012  # K; without a colour 0.006
     assert off[1] < off[0]
-    # Bars at borders of materials, of which an unknown colour makes more, hold a part of it.
-    assert holds(gray, truth) < holds(coloured, truth) - 0.15
+    # Bars hold a part of an unknown colour, as of what all reflections leave alike.
+    assert rms[0] > 1.5 * rms[1]
+    assert holds(gray, truth) < holds(coloured, truth) - 0.05
     assert min(holds(coloured, truth, str(quantity)) for quantity in truth.data_vars) > 0.9
     # An error of the ratio moves the object by as much as it adds to the budget.
     stated = (colour, 0.0), (colour, 0.02), (colour + 0.02, 0.0)
