@@ -5,9 +5,9 @@ The bands' null combination, scaled to the object's signal,
 .. math:: q = \sum_m w_m (z_m / k_m - z_1), \quad \sum_m w_m (1 - k_m) / k_m = 1
 
 holds no reflection; less the object's own signal it holds noise alone. If not, the object is as
-uncertain: by the reflection's leak into q, where the ratio is not that of the events (coloured
-bodies, unlike blurs, median filters, a camera that shakes), and by changes that no reflection
-explains (rapid heat that the model misses, pixels that drift).
+uncertain: by the reflection's leak into q, where the ratio differs from event to event (coloured
+bodies, unlike blurs, a camera that shakes), and by changes that no reflection explains (rapid heat
+that the model misses, pixels that drift).
 """
 
 from collections.abc import Callable
@@ -32,9 +32,9 @@ from dbthermal.separation._subspace.fused import FILMS
 
 Whole = npt.NDArray[np.intp]
 
-_BLOCK: Final = 8  # pixels along a side of what is averaged; of 4, wrong ratios hide in the noise
+_BLOCK: Final = 4  # pixels along a side of what is averaged
 _WINDOWS: Final = 4  # of some rows, that tell what a frame has in common
-_AROUND: Final = 3  # blocks along a side of a neighbourhood
+_AROUND: Final = 5  # blocks along a side of a neighbourhood
 # Samples of a row of a band, beyond which rows are not read two at a time: an hour of 640 columns
 # at 30 Hz takes 4.7 GB, not 5.7.
 _LONG: Final = 2**25
@@ -151,11 +151,11 @@ def _leak(blocks: _Blocks) -> Array:
     share = quotient(cross, energy, 0.0)
     noise = remainder * (energy + freedom * reflection) / _number(blocks)
     variance = quotient(noise, energy**2, 0.0)
-    # Mean square of the events' shares, less noise, by the weight of each: what all events leave
-    # alike is an error of the ratio, too. With it 0.92 of the intervals hold, for 0.67, behind a
-    # blur of 1.3 pixels in one band, in blocks of 8 pixels; in blocks of 4 0.70.
+    # Scatter of the events about their mean, less noise, by the weight of each.
     weight = quotient(energy, energy.sum(axis=0) + 0.0 * energy, 0.0)
-    scatter = (weight * (share**2 - variance)).sum(axis=0)
+    apart = share - (weight * share).sum(axis=0)
+    events = quotient(np.ones_like(energy[0]), (weight**2).sum(axis=0), 1.0)
+    scatter = (weight * (apart**2 - variance)).sum(axis=0) * quotient(events, events - 1.0, 0.0)
     doubt = np.sqrt(2.0 * ((weight * variance) ** 2).sum(axis=0))
     return np.asarray(np.sqrt(np.where(scatter > _SURE * doubt, scatter, 0.0)))
 

@@ -162,9 +162,9 @@ def test_a_known_colour_biases_nothing(seed: int, colour: float) -> None:
     assert bias[0] < -0.05
     assert abs(bias[1]) < 0.012  # K; without a colour 0.006
     assert off[1] < off[0]
-    # Bars hold a part of an unknown colour, as of what all reflections leave alike.
+    # Bars at borders of materials, of which an unknown colour makes more, hold a part of it.
     assert rms[0] > 1.5 * rms[1]
-    assert holds(gray, truth) < holds(coloured, truth) - 0.05
+    assert holds(gray, truth) < holds(coloured, truth) - 0.15
     assert min(holds(coloured, truth, str(quantity)) for quantity in truth.data_vars) > 0.9
     # An error of the ratio moves the object by as much as it adds to the budget.
     stated = (colour, 0.0), (colour, 0.02), (colour + 0.02, 0.0)
