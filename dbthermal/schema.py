@@ -321,7 +321,7 @@ class Status(Flags):
     NOT_CONVERGED = 1 << 12, "the optimiser stopped at its limit of steps or at no finite value"
     OBJECT_JUMP = 1 << 13, "sudden steps of the object, part of its curve; the values are valid"
     BANDS_APART = 1 << 14, "rapid changes differ between the bands: time offset or parallax"
-    ROLES_MAY_BE_SWAPPED = 1 << 15, "object may be background: low emissivity, or signal step lasts"
+    ROLES_MAY_BE_SWAPPED = 1 << 15, "object and background may be exchanged in the result"
     COMPLETED_FROM_MATERIAL = 1 << 16, "completed, not measured: emissivity from the same material"
     COMPLETED_FROM_PRIOR = 1 << 17, "completed, not measured: emissivity from a library, or stated"
     COMPLETED_FROM_SURROUNDINGS = 1 << 18, "completed, not measured: background from surroundings"

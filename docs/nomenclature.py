@@ -16,7 +16,9 @@ for standard deviation.
 The *reference band* is the band with the least noise; e is the emissivity of a band, e_ref that of
 the reference band. The *reflection ratio* of a band is its reflectivity over that of the reference
 band. The *background ratio* is the change of the reflected temperature in a band over that in the
-reference band. `drift_std` is of the emissivity in the reference band."""
+reference band. The *reflection shift* is the displacement of a reflection between the images of two
+displaced cameras. `drift_std` is the part of the emissivity's standard deviation that comes from
+background drift, in the reference band."""
 
 
 def nomenclature() -> str:
