@@ -156,7 +156,8 @@ def _row(entry: dict[str, Any]) -> Row:
 
 def _terms() -> Iterator[Row]:
     for term, value in REDUCTIONS.items():
-        names, quantity = (f"{term}: reduction [%]",), f"reduction of the error by adding the {term} term"
+        names = (f"{term}: reduction [%]",)
+        quantity = f"reduction of the error by adding the {term} term"
         yield Row("Table 1", quantity, "06_optimiser", names, value, "%", "value", 10.0)
 
 
