@@ -167,9 +167,8 @@ def seen(world: World, seed: int) -> tuple[xr.Dataset, Array]:
             front = gaussian_filter(views[0][frame], world.roughness[band])
             image = share * curve.counts(warm) + (1.0 - share - clear) * front
             image = gaussian_filter(image + clear * views[1][frame], world.blur[band])
-            view = moved(image, motion[band, frame], *held[frame])
-            view = view[inside, inside] + noise[frame]
-            film[band, frame] = median_filter(view, world.median[band])
+            view = moved(image, motion[band, frame], *held[frame])[inside, inside]
+            film[band, frame] = median_filter(view + noise[frame], world.median[band])
     coordinates = {
         "band": list(RIG.bands),
         "time": ("time", time, {"units": "s"}),

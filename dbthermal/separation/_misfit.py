@@ -117,8 +117,7 @@ def measure(inputs: Inputs, result: xr.Dataset, workers: int, *probes: Probe) ->
         for probe, values in zip(probes, zip(*sums, strict=True), strict=False)
     }
     # Changes that no reflection explains; 1/f noise of single pixels, alike in all octaves.
-    number = _number(blocks.pixels, _AROUND)
-    sure = _SURE * np.sqrt(2.0 / (number * smooth.HIGHEST_ORDER))
+    sure = _SURE * np.sqrt(2.0 / (_number(blocks.pixels, _AROUND) * smooth.HIGHEST_ORDER))
     change = _excess(blocks, blocks.rough, sure, 1.0)
     single = np.minimum(*(_excess(blocks, it, _ROUGH, _OCTAVES) for it in blocks.single))
 
@@ -226,26 +225,19 @@ def _of_rows(
     rough = np.stack([np.mean((means @ remainder) ** 2, axis=0), leverage * variances[0] + stated])
     blocks = np.where(number < 0.5 * _BLOCK**2, 0.0, number), rough, single
     changes = _Blocks(*(values.reshape(*values.shape[:-1], *shape) for values in blocks))
-    events = np.eye(frames.size // length + 1)[event].T
-    return changes, _events(inputs, number, noise, sums, basis, events, shape), levels
+    return changes, _events(inputs, number, noise, sums, basis, event, shape[1]), levels
 
 
 def _events(
-    inputs: Inputs,
-    number: Array,
-    noise: Array,
-    sums: Array,
-    basis: Array,
-    events: Array,
-    shape: tuple[int, int],
+    inputs: Inputs, number: Array, noise: Array, sums: Array, basis: Array, event: Whole, width: int
 ) -> _Events:
     """What reflections leave in each event, of blocks that are wider than those of changes."""
-    width = shape[1]
     size = _BLOCK**2 * _block_sums(np.ones((1, number.size)), width, _WIDER)[0]
     number = _block_sums(number[np.newaxis], width, _WIDER)[0]
     noise = _block_sums(noise, width, _WIDER)
     sums = np.array([_block_sums(film, width, _WIDER) for film in sums])
     remainder, reflection, noise = _means(inputs, number, noise, sums, basis)
+    events = np.eye(event[-1] + 1)[event].T
     freedom = np.outer(events @ (1.0 - np.sum(basis**2, axis=1)), np.ones(number.size))
     averages: tuple[Array, ...] = (
         np.where(number < 0.5 * size, 0.0, number),
@@ -254,8 +246,8 @@ def _events(
         - freedom * noise[2:0:-1, np.newaxis],
         freedom,
     )
-    shape = -(-shape[0] // _WIDER), -(-width // _WIDER)
-    return _Events(*(values.reshape(*values.shape[:-1], *shape) for values in averages))
+    width = -(-width // _WIDER)
+    return _Events(*(values.reshape(*values.shape[:-1], -1, width) for values in averages))
 
 
 def _means(
