@@ -103,7 +103,7 @@ FRAME_FLAGS: Final = _of("band time", "1", "flags of the frame, 0 is good", "uin
 SHUTTER_CLOSED: Final = "shutter_closed"
 """Name, in `frame_flags`, of the bit of a frame taken while the camera's shutter was closed."""
 
-NOISE_FACTOR: Final = _of("band", "1", "noise after the alignment over that before")
+NOISE_FACTOR: Final = _of("band", "1", "noise after alignment divided by noise before alignment")
 """Variable `noise_factor`: by how much interpolation between frames has lessened the noise."""
 
 PATTERN_STD: Final = _of("band", "count", "standard deviation of the residual fixed pattern")
@@ -148,7 +148,7 @@ STAGES: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
             **_with_std("object_temperature", "time y x", "K", "object temperature"),
             **_with_std("background_temperature", "time y x", "K", "background temperature"),
             **_with_std("emissivity", "band y x", "1", "band emissivity"),
-            **_with_std("reflection_ratio", "band y x", "1", "reflection ratio"),
+            **_with_std("reflection_ratio", "band y x", "1", "reflection ratio, (1-e)/(1-e_ref)"),
             "status": STATUS,
         },
         "blackbody": {"counts": _of("band temperature", "count", "mean blackbody signal")},
@@ -169,7 +169,7 @@ STAGES: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
             "offset": _of("band", "count", "Sakuma-Hattori offset"),
             "linear_slope": _of("band", "count K-1", "slope of the linear response"),
             "linear_intercept": _of("band", "count", "intercept of the linear response"),
-            "reference_temperature": _of("", "K", "reference temperature"),
+            "reference_temperature": _of("", "K", "temperature about which counts are linearised"),
             "temperature_min": _of("", "K", "lowest calibrated temperature"),
             "temperature_max": _of("", "K", "highest calibrated temperature"),
         },
@@ -212,7 +212,7 @@ OPTIONAL: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
             "emissivity_covariance": _of(
                 "band other_band y x", "1", "covariance of band emissivities", "float32"
             ),
-            "drift_std": _of("y x", "1", "drift part of the reference emissivity std", "float32"),
+            "drift_std": _of("y x", "1", "part of emissivity_std by background drift", "float32"),
             "noise": _of("band", "count", "noise that was used"),
             "bridged": _of("time y x", "1", "interpolated in time, not measured", "bool"),
             "material": _of("y x", "1", "material, -1 for none", "int32"),
@@ -243,7 +243,7 @@ OPTIONAL: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
             "blackbody_accuracy": _of("", "K", "std of the blackbody temperatures' shared error"),
             "blackbody_emissivity": _of("", "1", "emissivity of the blackbody"),
             "room_temperature": _of("", "K", "temperature of the room that the blackbody reflects"),
-            "background_ratio_std": _of("", "1", "std of the background ratio about 1 (gray)"),
+            "background_ratio_std": _of("", "1", "std of the background ratio (1 for gray)"),
         },
     }
 )
@@ -321,7 +321,7 @@ class Status(Flags):
     NOT_CONVERGED = 1 << 12, "the optimiser stopped at its limit of steps or at no finite value"
     OBJECT_JUMP = 1 << 13, "sudden steps of the object, part of its curve; the values are valid"
     BANDS_APART = 1 << 14, "rapid changes differ between the bands: time offset or parallax"
-    ROLES_MAY_BE_SWAPPED = 1 << 15, "object may be the background: low emissivity or lasting step"
+    ROLES_MAY_BE_SWAPPED = 1 << 15, "object may be background: low emissivity, or signal step lasts"
     COMPLETED_FROM_MATERIAL = 1 << 16, "completed, not measured: emissivity from the same material"
     COMPLETED_FROM_PRIOR = 1 << 17, "completed, not measured: emissivity from a library, or stated"
     COMPLETED_FROM_SURROUNDINGS = 1 << 18, "completed, not measured: background from surroundings"

@@ -11,7 +11,12 @@ _PREFACE: Final = """# Nomenclature
 Variables at each stage of the data stream. This page is made from `dbthermal.schema` by
 `python docs/nomenclature.py > docs/nomenclature.md`. Temperatures are in kelvin, other units are
 SI; `count` is the unit of the detector's signal. A variable in italics is optional. "std" is short
-for standard deviation."""
+for standard deviation.
+
+The *reference band* is the band with the least noise; e is the emissivity of a band, e_ref that of
+the reference band. The *reflection ratio* of a band is its reflectivity over that of the reference
+band. The *background ratio* is the change of the reflected temperature in a band over that in the
+reference band. `drift_std` is of the emissivity in the reference band."""
 
 
 def nomenclature() -> str:
