@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 import xarray as xr
 from scipy.interpolate import interp1d
-from scipy.ndimage import affine_transform, gaussian_filter
+from scipy.ndimage import affine_transform, gaussian_filter, median_filter
 from scipy.special import expit
 
 from dbthermal import response as responses
@@ -34,6 +34,7 @@ class World:
 
     noise: Pair = (RIG.noise[0], RIG.noise[1])  # [K]
     blur: Pair = (0.0, 0.0)  # of the lenses [pixel]
+    median: tuple[int, int] = (1, 1)  # side of the median filter in each camera [pixel]
     roughness: Pair = (0.0, 0.0)  # blur of what is mirrored [pixel]
     shake: Pair = (0.0, 0.0)  # of the cameras, correlated over 0.15 s [pixel]
     off: float = 0.0  # columns by which the second image lies beside the first [pixel]
@@ -166,8 +167,8 @@ def seen(world: World, seed: int) -> tuple[xr.Dataset, Array]:
             front = gaussian_filter(views[0][frame], world.roughness[band])
             image = share * curve.counts(warm) + (1.0 - share - clear) * front
             image = gaussian_filter(image + clear * views[1][frame], world.blur[band])
-            view = moved(image, motion[band, frame], *held[frame])
-            film[band, frame] = view[inside, inside] + noise[frame]
+            view = moved(image, motion[band, frame], *held[frame])[inside, inside]
+            film[band, frame] = median_filter(view + noise[frame], world.median[band])
     coordinates = {
         "band": list(RIG.bands),
         "time": ("time", time, {"units": "s"}),

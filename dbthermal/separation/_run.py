@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
-from itertools import accumulate, product
+from itertools import accumulate
 from multiprocessing import parent_process
 from pathlib import Path
 from types import MappingProxyType
@@ -58,15 +58,14 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
 ) -> None:
     """Separate captures of any size from disk to disk, by blocks of rows, by several processes.
 
-    Each block of rows, or of columns of a row that does not fit in the memory, is separated as by
-    `solve` and written by one process. A run that was killed goes on where it stopped, to the same
-    bytes; a target that the same run has made is left as it is. A capture is recognised by its
-    store's checksums; one in memory or lazy by its values.
+    Each block of rows is separated as by `solve` and written by one process. A run that was killed
+    goes on where it stopped, to the same bytes; a target that the same run has made is left as it
+    is. A capture is recognised by its store's checksums; one in memory or lazy by its values.
 
-    TypeError or ValueError as from `solve`; if the memory is too small for a column of a row, or
-    for the chunks of dask's that hold it, or the parts are of another run. BlockingIOError, with
-    its name, while another process separates into the target. ExceptionGroup of the errors of
-    several captures, each with the capture's name; all others are finished.
+    TypeError or ValueError as from `solve`; if the memory is too small for a row, or for the chunks
+    of dask's that hold it, or the parts are of another run. BlockingIOError, with its name, while
+    another process separates into the target. ExceptionGroup of the errors of several captures,
+    each with the capture's name; all others are finished.
 
     Parameters
     ----------
@@ -86,10 +85,9 @@ def run(  # noqa: PLR0913 - those of `solve` are among them
         Of `concurrent.futures`, or with its interface, as from ``distributed.Client.get_executor``;
         by default two threads, or one where the memory is too small for two.
     memory : float
-        Largest memory of a process [byte]; with less, a block has fewer rows than 32, or columns of
-        a single one, so that a capture of any length fits. A process of an executor separates one
-        block at a time, a ThreadPoolExecutor one in each thread. The process that compiles, the
-        first after the installation, takes 0.35 GB more.
+        Largest memory of a process [byte]; with less, a block has fewer rows than 32. A process of
+        an executor separates one block at a time, a ThreadPoolExecutor one in each thread. The
+        process that compiles, the first after the installation, takes 0.35 GB more.
     provenance : mapping, optional
         See `store.save`.
     progress : bool
@@ -156,13 +154,12 @@ class _Plan:
     method: str
     options: Mapping[str, Any]  # of `solve`
     height: int = 0  # rows of a block
-    width: int | None = None  # columns of a block of less than a row
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
-    def of_pixels(self, **places: slice) -> "_Plan":
-        """Plan with the options of some rows and columns."""
+    def of_rows(self, rows: slice) -> "_Plan":
+        """Plan with the options of some rows."""
         arrays = {
-            name: value.isel(places, missing_dims="ignore")
+            name: value.isel(y=rows, missing_dims="ignore")
             for name, value in self.options.items()
             if isinstance(value, xr.DataArray)
         }
@@ -185,9 +182,9 @@ def _separate_capture(
     method = get_method(plan.method)
     checked = _inputs.check(capture, plan.response, method, **plan.options)
     settings = plan.options["settings"]
-    threads, (height, width), read = _share(capture, memory, executor, method, settings)
+    threads, height, read = _share(capture, memory, executor, method, settings)
     with ThreadPoolExecutor(threads) as pool:
-        content = _content(source, capture, (read, width), executor or pool)
+        content = _content(source, capture, read, executor or pool)
     response = checked.response  # with one noise for all blocks
     digest = _digest([content, response, plan.method, plan.options])
     made = json.loads(json.dumps({**(provenance or store.provenance({})), "run": digest}))
@@ -197,25 +194,20 @@ def _separate_capture(
         shutil.rmtree(folder, ignore_errors=True)  # of a run that was killed at its very end
         return
     plan = replace(plan, response=response, height=height, provenance=made)
-    plan = plan if width == capture.sizes["x"] else replace(plan, width=width)
-    _begin(folder, {"height": height, "width": width, **made})
-    image, starts = capture.sizes["y"], range(0, capture.sizes["x"], width)
-    paths = {
-        top: {start: folder / f"{top:06d}-{start:06d}.zarr" for start in starts}
-        for top in range(0, image, height)
-    }
+    _begin(folder, {"height": height, **made})
+    image = capture.sizes["y"]
+    paths = {top: folder / f"{top:06d}.zarr" for top in range(0, image, height)}
     # Separate the blocks that are missing, those of one reading together.
     with ThreadPoolExecutor(threads) as pool:
         missing = list[Future[None]]()
-        for top, start in product(range(0, image, read), starts):
-            pixels = {"y": slice(top, min(top + read, image)), "x": slice(start, start + width)}
-            blocks = range(top, pixels["y"].stop, height)
-            places = {row - top: paths[row][start] for row in blocks}
-            places = {row: path for row, path in places.items() if not path.exists()}
+        for top in range(0, image, read):
+            rows = slice(top, min(top + read, image))
+            blocks = range(top, rows.stop, height)
+            places = {row - top: paths[row] for row in blocks if not paths[row].exists()}
             if places:
-                block = source if isinstance(source, Path) else capture.isel(pixels)
-                task = block, pixels, places, plan.of_pixels(**pixels)
-                missing.append((executor or pool).submit(_separate_pixels, *task))
+                block = source if isinstance(source, Path) else capture.isel(y=rows)
+                task = block, rows, places, plan.of_rows(rows)
+                missing.append((executor or pool).submit(_separate_rows, *task))
         jobs.extend(missing)
         bar.total = (bar.total or 0) + len(missing)
         try:
@@ -225,28 +217,23 @@ def _separate_capture(
         finally:
             for job in missing:
                 job.cancel()
-    rows = [columns[0] for columns in paths.values()]
-    if len(starts) > 1:
-        rows = [folder / f"{top:06d}.zarr" for top in paths]
-        for columns, whole in zip(paths.values(), rows, strict=True):
-            store.join_parts(columns.values(), whole, "x")
-    store.join_parts(rows, target)
+    store.join_parts(paths.values(), target)
     shutil.rmtree(folder)
 
 
-def _separate_pixels(
-    source: Path | xr.Dataset, pixels: dict[str, slice], paths: Mapping[int, Path], plan: _Plan
+def _separate_rows(
+    source: Path | xr.Dataset, rows: slice, paths: Mapping[int, Path], plan: _Plan
 ) -> None:
-    """Read pixels of a capture on disk or in hand; write each block of them whole or not."""
+    """Read rows of a capture on disk or in hand; write each block of them whole or not."""
     with chunks_in_turn() if parent_process() else nullcontext():  # as an executor's process
-        capture = store.open_dataset(source).isel(pixels) if isinstance(source, Path) else source
+        capture = store.open_dataset(source).isel(y=rows) if isinstance(source, Path) else source
         # What is dask's is computed here: its own threads, or the cluster's, would hold more.
         capture = capture.load(scheduler="synchronous")
         for top, path in paths.items():
             block = slice(top, top + plan.height)
-            options = plan.of_pixels(y=block).options
+            options = plan.of_rows(block).options
             result = solve(capture.isel(y=block), plan.response, plan.method, workers=1, **options)
-            store.save_rows([result], path, plan.provenance, plan.height, plan.width)
+            store.save_rows([result], path, plan.provenance, plan.height)
             del result  # before the next block is in memory
 
 
@@ -271,48 +258,42 @@ def _pairs(source: Any, target: Any) -> list[tuple[Path | xr.Dataset, Path]]:
 
 def _share(
     capture: xr.Dataset, memory: float, executor: Executor | None, method: Method, settings: Any
-) -> tuple[int, tuple[int, int], int]:
-    """Threads of a process, rows and columns of a block, as `solve` reads or fewer, rows read."""
+) -> tuple[int, int, int]:
+    """Threads of a process, rows of a block, as `solve` reads or fewer, and rows read."""
     counts, columns = capture["counts"], capture.sizes["x"]
     chunks, stored = counts.chunksizes, counts.encoding.get("preferred_chunks", {})
-    column, lazy = counts[..., 0, 0].size, chunks.get("y", ())
-    chunk, chunk_width = (max(chunks.get(dim, ()), default=stored.get(dim, 1)) for dim in "yx")
+    row, lazy = counts[..., 0, :].size, chunks.get("y", ())
+    chunk = max(lazy, default=stored.get("y", 1))
     sample = _TILE if method.compiled else _TILE * _TIMES
-    tile = sample * largest(method, settings, capture) * column
+    tile = sample * largest(method, settings, capture) * (row // columns)
 
     def read(height: int) -> tuple[int, bool]:
         """Rows read together, blocks as far as a chunk of dask's; whether they are whole chunks."""
         rows = height * math.ceil(chunk / height) if lazy else height
         return rows, rows % chunk == 0 and set(lazy[:-1]) <= {chunk}
 
-    def need(height: int, width: int = columns) -> float:
+    def need(height: int) -> float:
         """Memory [byte] of the chunks read, of the blocks' samples, and of a tile."""
         rows, whole = read(height)
-        held = width if width == columns else min(columns, width + 2 * chunk_width)
-        read_again = (rows if whole else rows + 2 * chunk) * held if lazy else 0
-        samples = _READ * (rows * width + read_again) + _SAMPLE * height * width
-        return samples * column + min(sample * column * height * width, tile)
+        read_again = (rows if whole else rows + 2 * chunk) if lazy else 0
+        samples = _READ * (rows + read_again) + _SAMPLE * height
+        return samples * row + min(sample * row * height, tile)
 
-    fewest = columns if lazy else 1  # a chunk of dask's is made anew for each of its blocks
-    threads = 1 if executor or memory < BASE + 2 * need(1, fewest) else 2
+    threads = 1 if executor or memory < BASE + 2 * need(1) else 2
     if isinstance(executor, ThreadPoolExecutor):
         threads = executor._max_workers
     free = (memory - BASE) / threads
-    if free < need(1, 1):
-        raise ValueError(
-            f"Invalid memory {memory:g} byte. Must be at least {BASE + threads * need(1, 1):g} for "
-            f"one pixel of {capture.sizes['time']} frames"
-            + (f", of a source in chunks of {chunk} x {chunk_width}." if lazy else ".")
-        )
-    # Columns of a row that does not fit: as many as do, of whole chunks if they can be.
     if free < need(1):
-        width = max(count for count in range(1, columns) if need(1, count) <= free)
-        return threads, (1, width - width % chunk_width or width), read(1)[0]
+        raise ValueError(
+            f"Invalid memory {memory:g} byte. Must be at least {BASE + threads * need(1):g} for "
+            f"a row of {columns} pixels and {capture.sizes['time']} frames"
+            + (f", of a source in chunks of {chunk} rows." if lazy else ".")
+        )
     # The highest block that fits; a lower one, by less than half, if it reads no chunk twice.
     highest = min(BLOCK_ROWS, capture.sizes["y"])
     fit = [height for height in range(1, highest + 1) if need(height) <= free]
     height = max([rows for rows in fit if 2 * rows > fit[-1] and read(rows)[1]] or fit)
-    return threads, (height, columns), read(height)[0]
+    return threads, height, read(height)[0]
 
 
 def _begin(folder: Path, plan: Mapping[str, Any]) -> None:
@@ -332,22 +313,15 @@ def _begin(folder: Path, plan: Mapping[str, Any]) -> None:
         raise ValueError(f"Invalid folder '{folder}': {state}. {rule}.")
 
 
-def _content(
-    source: Path | xr.Dataset, capture: xr.Dataset, read: tuple[int, int], executor: Executor
-) -> Any:
+def _content(source: Path | xr.Dataset, capture: xr.Dataset, read: int, executor: Executor) -> Any:
     """Checksums of a capture's store, or digests of its values, which the workers read."""
     if isinstance(source, Path) and (sums := last_sums(source)):
         return sums
     films = [name for name, variable in capture.variables.items() if "y" in variable.dims]
     constant, every = capture.drop_vars(films), capture.drop_vars(capture.variables.keys() - films)
-    rows, width = read
-    heights = capture["counts"].chunksizes.get("y") or [rows] * math.ceil(capture.sizes["y"] / rows)
-    # By rows, or by so many columns of a row that does not fit in the memory.
-    blocks = [
-        every.isel(y=slice(end - height, end), x=slice(start, start + width))
-        for end, height in zip(accumulate(heights), heights, strict=True)
-        for start in range(0, capture.sizes["x"], width)
-    ]
+    heights = capture["counts"].chunksizes.get("y") or [read] * math.ceil(capture.sizes["y"] / read)
+    ends = zip(accumulate(heights), heights, strict=True)
+    blocks = [every.isel(y=slice(end - height, end)) for end, height in ends]
     in_memory = all(array.variable._in_memory for array in capture.values())
     digests = map(_row_digests, blocks) if in_memory else executor.map(_row_digests, blocks)
     return [_digest(constant), "".join(digests)]

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import AbstractContextManager
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 import xarray as xr
@@ -37,14 +37,11 @@ _DECODED: Final = {"_FillValue", "missing_value", "scale_factor", "add_offset"} 
 }
 
 
-def _chunks(
-    variable: xr.Variable | xr.DataArray, height: int | None = None, length: int | None = None
-) -> tuple[int, ...]:
+def _chunks(variable: xr.Variable | xr.DataArray, height: int | None = None) -> tuple[int, ...]:
     """Chunk sizes for a variable: pieces of rows, whole in every dimension but y and x."""
     # Every stage works pixel by pixel on all frames and bands, and reads rows of the image.
     sizes = {str(dim): max(1, size) for dim, size in variable.sizes.items()}
-    for dim, size in (("y", height), ("x", length)):
-        sizes |= {dim: size} if size and dim in sizes else {}
+    sizes |= {"y": height} if height and "y" in sizes else {}
     if not {"y", "x"} <= sizes.keys():
         return tuple(sizes.values())
     # The fewest whole rows that have the bytes before compression, or equal pieces of one row.
@@ -52,9 +49,7 @@ def _chunks(
     pixels = math.ceil(_CHUNK_BYTES / pixel_bytes)
     width = math.ceil(sizes["x"] / max(1, sizes["x"] // pixels))
     rows = min(sizes["y"], math.ceil(pixels / width))
-    # Chunks divide a height and a length, so that the next block of rows begins one.
-    if length:
-        width = next(count for count in range(width, length + 1) if length % count == 0)
+    # Chunks divide a height, so that the next block of rows begins one.
     if height:
         rows = next(count for count in range(rows, height + 1) if height % count == 0)
     return tuple((sizes | {"y": rows, "x": width}).values())
@@ -94,7 +89,6 @@ def save_rows(
     path: str | Path,
     provenance: Mapping[str, Any],
     height: int | None = None,
-    width: int | None = None,
 ) -> None:
     """Save a dataset as `save` does, by blocks of rows from the first to the last.
 
@@ -106,25 +100,23 @@ def save_rows(
         and for a block of other variables, coordinates or units.
     path, provenance : str or Path, mapping
         See `save`.
-    height, width : int, optional
-        Rows of each block, by default of the first, and columns of each folder for `join_parts`
-        along x; all folders have the same, only the last may have fewer.
+    height : int, optional
+        Rows of each block, by default of the first; only the last block may have fewer.
 
     See the example of `join_parts`.
     """
     following = iter(blocks)
     if (first := next(following, None)) is None:
         raise ValueError(f"No rows to save as '{path}'. Must be at least one part.")
-    for name, size in {"height": height, "width": width}.items():
-        if size is not None and (type(size) is not int or size < 1):
-            raise ValueError(f"Invalid {name} {size!r} of the rows. Must be a whole number from 1.")
-    _save(chain([first], following), path, provenance, height or first.sizes.get("y"), width)
+    if height is not None and (type(height) is not int or height < 1):
+        raise ValueError(f"Invalid height {height!r} of the rows. Must be a whole number from 1.")
+    _save(chain([first], following), path, provenance, height or first.sizes.get("y"))
 
 
 def _save(
-    blocks: Iterable[xr.Dataset], path: str | Path, provenance: Any, *sizes: int | None
+    blocks: Iterable[xr.Dataset], path: str | Path, provenance: Any, height: int | None = None
 ) -> None:
-    """Save blocks of rows, of a height and width that chunks then divide."""
+    """Save blocks of rows, of a height that chunks then divide."""
     schema.require(provenance, Mapping, "provenance")
     first, attrs = xr.Dataset(), {"provenance": json.loads(as_json(provenance))}
     with whole(path, ".zarr") as folder:
@@ -138,7 +130,7 @@ def _save(
             # Of all kinds of text zarr's format 3 specifies only that of variable length.
             plain = _with_text_as(rows.drop_encoding(), "U", np.dtypes.StringDType())
             plain.attrs = attrs  # each block has them, or zarr drops the store's attributes
-            chunks = {n: _chunks(array, *sizes) for n, array in plain.variables.items()}
+            chunks = {n: _chunks(array, height) for n, array in plain.variables.items()}
             encoding = {n: {"chunks": c, "compressors": _COMPRESSORS} for n, c in chunks.items()}
             options: dict[str, Any] = {"mode": "w-", "encoding": encoding}
             if number > 0:
@@ -262,18 +254,16 @@ def _open(checked: integrity.CheckedStore, leave: Iterable[str] = ()) -> xr.Data
     return dataset
 
 
-def join_parts(
-    folders: Iterable[str | Path], path: str | Path, dim: Literal["y", "x"] = "y"
-) -> None:
-    """Join datasets of rows or columns that follow one another; chunks are linked, and not read.
+def join_parts(folders: Iterable[str | Path], path: str | Path) -> None:
+    """Join datasets of rows that follow one another; chunks are linked, and not read.
 
     Parameters
     ----------
     folders : iterable of str or Path
-        From `save_rows`, all of one `height` or `width` except the last. They stay as they are; on
-        a disk without hard links their chunks are copied.
-    path, dim : str or Path, {"y", "x"}
-        Folder ``*.zarr`` of the whole, with the attributes of the first; along which they follow.
+        From `save_rows`, all of one `height` except the last. They stay as they are; on a disk
+        without hard links their chunks are copied.
+    path : str or Path
+        Folder ``*.zarr`` of the whole, with the attributes of the first.
 
     Examples
     --------
@@ -301,11 +291,11 @@ def join_parts(
         for name, array in zarr.open_group(integrity.SummedStore(folder), mode="r+").arrays():
             metadata: Any = array.metadata
             dims, shape = [*(metadata.dimension_names or ())], [*array.shape]
-            for source in sources[1:] if dim in dims else ():
-                axis = dims.index(dim)
+            for source in sources[1:] if "y" in dims else ():
+                axis = dims.index("y")
                 number, remainder = divmod(shape[axis], array.chunks[axis])
                 if remainder:
-                    label = f"{shape[axis]} rows or columns in chunks of {array.chunks[axis]}"
+                    label = f"{shape[axis]} rows in chunks of {array.chunks[axis]}"
                     rule = "Must follow whole chunks"
                     raise ValueError(f"Invalid part '{source}' after {label}. {rule}.")
                 for key, crc in integrity.last_sums(source).items():

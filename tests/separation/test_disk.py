@@ -73,25 +73,19 @@ def test_run_is_solve(path: Path, tmp_path: Path) -> None:
     assert [one.name for one in tmp_path.iterdir()] == ["result.zarr"]
 
 
-def test_columns_of_a_row_are_the_whole_row(path: Path, tmp_path: Path) -> None:
-    """In the memory of seven pixels, or one, a row is separated by columns, with maps of each."""
-    rng, capture = np.random.default_rng(3), store.open_dataset(path).load()
-    capture = capture.isel(y=slice(2, 5)).assign_coords(x=100 + np.arange(24))
-    store.save(capture, tmp_path / "rows.zarr", {})
-    known = xr.DataArray(rng.uniform(0.7, 0.87, (3, 24)), dims=("y", "x"))
+def test_maps_are_cut_by_rows(path: Path, tmp_path: Path) -> None:
+    """Emissivities and a mask of each pixel are those of its block of rows."""
+    rng, response = np.random.default_rng(3), RIG.response()
+    known = xr.DataArray(rng.uniform(0.7, 0.87, (41, 24)), dims=("y", "x"))
     known = xr.concat([known + 0.1, known], "band").assign_coords(band=list(RIG.bands))
-    mask = xr.DataArray(rng.random((3, 24)) < 0.9, dims=("y", "x"))
-    memory = _run.BASE + 2 * 7 * (_run._READ + _run._SAMPLE + _run._TILE) * 2 * 64
-    given: dict[str, Any] = {"emissivity": known, "mask": mask}
-    for method, options in (("subspace", dict[str, Any]()), ("calibrated", given)):
-        for source in (tmp_path / "rows.zarr", capture):
-            target, response = tmp_path / "result.zarr", RIG.response()
-            separation.run(source, target, response, method, memory=memory, **options)
-            result = store.open_dataset(target)
-            assert result["status"].encoding["chunks"] == (1, 7 if method == "subspace" else 1)
-            expected = separation.solve(capture, response, method, **options)
-            xr.testing.assert_identical(result.load().drop_attrs(), expected.drop_attrs())
-    assert {one.name for one in tmp_path.iterdir()} == {"rows.zarr", "result.zarr"}
+    mask = xr.DataArray(rng.random((41, 24)) < 0.9, dims=("y", "x"))
+    maps: dict[str, Any] = {"emissivity": known, "mask": mask}
+    target = tmp_path / "result.zarr"
+    separation.run(path, target, response, "calibrated", memory=MEMORY, **maps)
+    expected = separation.solve(store.open_dataset(path).load(), response, "calibrated", **maps)
+    xr.testing.assert_identical(
+        store.open_dataset(target).load().drop_attrs(), expected.drop_attrs()
+    )
 
 
 def peak(source: Path, target: Path, memory: float) -> float:
@@ -269,7 +263,7 @@ def test_a_join_that_is_cut_short_loses_nothing(
         with pytest.raises(OSError, match="No space"):
             separation.run(path, tmp_path / "cut.zarr", RIG.response(), **OPTIONS)
     assert not (tmp_path / "cut.zarr").exists()
-    monkeypatch.setattr(_run, "_separate_pixels", None)
+    monkeypatch.setattr(_run, "_separate_rows", None)
     separation.run(path, tmp_path / "cut.zarr", RIG.response(), **OPTIONS)
     assert files(tmp_path / "cut.zarr") == files(tmp_path / "rest.zarr")
 

@@ -29,8 +29,10 @@ WORLDS: dict[str, tuple[World, str, str]] = {
     "frames' levels": (World(level=(0.01, 0.1)), "level of whole frames", "plain"),
     "level wanders": (World(wander=(0.0, 0.1)), "level of whole frames", ""),
     "fabrics": (World(fabric=(0.92, 0.80)), "", ""),
+    "half of the people in fabric": (World(fabric=(0.97, 0.94)), "", ""),
     "rough surface": (World(roughness=(2.0, 2.8)), "not equally sharp", ""),
     "second camera sharper": (World(blur=(1.2, 0.4)), "not equally sharp", ""),
+    "median filters": (World(median=(3, 3)), "", ""),
     "metal beside paint": (World(surface=(METAL, (0.93, 0.82))), "", ""),
     "bare metal, apart": (
         World(parallax=2.0, noise=(0.02, 0.03), surface=((0.37, 0.30), (0.86, 0.72))),
