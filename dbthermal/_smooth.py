@@ -64,9 +64,10 @@ class Subspace:
         return result.T
 
 
-def leading(samples: npt.NDArray[Any], count: int) -> npt.NDArray[Any]:
-    """Orthonormal functions of time (time, function) that hold most of samples (pixel, time)."""
+def leading(samples: npt.NDArray[Any], count: int, slow: Array | None = None) -> Array:
+    """Functions (time, function) of most of samples (pixel, time), outside slow ones; orthonormal."""
     sample = np.asarray(samples[:: max(1, len(samples) // (_FOR_EACH * count))], np.float64)
+    sample = sample if slow is None else sample - sample @ slow @ slow.T
     if len(sample) < sample.shape[1]:
         # LAPACK's default algorithm, gesdd, does not converge on some samples that are finite.
         sizes, functions = svd(sample, full_matrices=False, lapack_driver="gesvd")[1:]

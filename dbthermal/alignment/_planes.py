@@ -289,8 +289,7 @@ def _window_equations(corrected: xr.Dataset, scale: Scale) -> Iterator[tuple[Arr
     segment = schema.segments(corrected)[frames]
     orders = min(_ORDER, time.size // 4), time.size // 4
     curves = [smooth.subspace(time, order, segment=segment).functions for order in orders]
-    changes = [signals - signals @ block @ block.T for block in curves]
-    functions = [smooth.leading(change, _RAPID_PLANES) for change in changes]
+    functions = [smooth.leading(signals, _RAPID_PLANES, block) for block in curves]
     rates = [np.gradient(block, axis=0).T @ block for block in functions]
 
     # Sums over the windows of rows of windows.
@@ -304,7 +303,8 @@ def _window_equations(corrected: xr.Dataset, scale: Scale) -> Iterator[tuple[Arr
         film = films(slice(top, top + side), columns)
         places = np.indices(film.shape[2:]).astype(np.float64)
         for block, function, rate in zip(sums, functions, rates, strict=True):
-            planes = np.tensordot(film, function.astype(np.float32), (1, 0))
+            planes = film.reshape(2, time.size, -1).mT @ function.astype(np.float32)
+            planes = planes.reshape(2, *film.shape[2:], -1)
             first, second = images.splines(planes[0], _BLUR), images.blurred(planes[1], _BLUR)
             even, steps = np.ones((1, *places.shape[1:], 1), np.float32), rate.astype(np.float32)
             pairs = images.products(first, [second], places, even, steps)[0][0].sum(axis=0)

@@ -19,7 +19,7 @@ from scipy.signal import fftconvolve
 
 from dbthermal import _smooth as smooth
 from dbthermal import schema
-from dbthermal._arrays import Array, empty, quotient, release
+from dbthermal._arrays import Array, empty, quotient, release, select
 from dbthermal._samples import without_gaps
 from dbthermal.separation import _misfit as misfits
 from dbthermal.separation._inputs import Inputs
@@ -235,9 +235,8 @@ def _equations(
     basis = misfits.smooth_functions(inputs, frames)
     # Leading functions of time hold most of the rapid changes, at less cost.
     if leading is not None:
-        changes = films[0][:, pixels]
-        changes = smooth.leading((changes - basis @ (basis.T @ changes)).T, leading)
-        films = np.einsum("tr,btp->brp", changes, films, optimize=True)
+        changes = smooth.leading(select(films[0], pixels).T, leading, basis)
+        films = changes.T @ films
         basis = np.zeros((len(films[0]), 0))
     if not films.size:  # without a pixel
         return 0.0, 0.0, 0.0

@@ -165,7 +165,7 @@ def common_frames(
     usable = ~unusable(status)
     if not np.any(usable):
         return []
-    frames = np.mean(valid[:, usable], axis=1) > MOST_MISSING
+    frames = np.count_nonzero(valid & usable, axis=1) > MOST_MISSING * np.count_nonzero(usable)
     enough = frames.sum() >= fewest
     complete = usable & enough & np.all(valid[frames], axis=0)
     # Flag and clear, in place, pixels that lack a frame; all pixels where frames are too few.

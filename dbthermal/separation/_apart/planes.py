@@ -272,7 +272,7 @@ def _functions(inputs: Inputs) -> Array:
     counts, frames = quality.sample(capture, _SAMPLE)
     basis = system.smooth_functions(capture, frames).functions
     signals = counts[inputs.bands[0]]
-    rapid = smooth.leading((signals - basis @ (basis.T @ signals)).T, _PLANES)
+    rapid = smooth.leading(signals.T, _PLANES, basis)
     functions = np.zeros((frames.size, rapid.shape[1]))
     functions[frames] = rapid
     return functions
