@@ -35,7 +35,7 @@ Whole = npt.NDArray[np.intp]
 _BLOCK: Final = 4  # pixels along a side of what is averaged for changes
 _WINDOWS: Final = 4  # of some rows, that tell what a frame has in common
 # Blocks along a side of a neighbourhood, for changes and for events, whose blocks are wider: behind
-# a blur of 1.3 pixels in one band 0.92 of the intervals hold, in blocks as for changes 0.70.
+# a blur of 1.3 pixels in one band 0.87 of the intervals hold, in blocks as for changes 0.70.
 _AROUND, _AROUND_EVENTS, _WIDER = 5, 3, 2
 # Samples of a row of a band, beyond which rows are not read two at a time: an hour of 640 columns
 # at 30 Hz takes 4.7 GB, not 5.7.
