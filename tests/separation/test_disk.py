@@ -76,11 +76,11 @@ def test_run_is_solve(path: Path, tmp_path: Path) -> None:
 def test_columns_of_a_row_are_the_whole_row(path: Path, tmp_path: Path) -> None:
     """In the memory of seven pixels, or one, a row is separated by columns, with maps of each."""
     rng, capture = np.random.default_rng(3), store.open_dataset(path).load()
-    capture = capture.isel(y=slice(2, 5)).assign_coords(x=100 + np.arange(24))
+    capture = capture.isel(y=slice(2, 4), x=slice(9)).assign_coords(x=100 + np.arange(9))
     store.save(capture, tmp_path / "rows.zarr", {})
-    known = xr.DataArray(rng.uniform(0.7, 0.87, (3, 24)), dims=("y", "x"))
+    known = xr.DataArray(rng.uniform(0.7, 0.87, (2, 9)), dims=("y", "x"))
     known = xr.concat([known + 0.1, known], "band").assign_coords(band=list(RIG.bands))
-    mask = xr.DataArray(rng.random((3, 24)) < 0.9, dims=("y", "x"))
+    mask = xr.DataArray(rng.random((2, 9)) < 0.9, dims=("y", "x"))
     memory = _run.BASE + 2 * 7 * (_run._READ + _run._SAMPLE + _run._TILE) * 2 * 64
     given: dict[str, Any] = {"emissivity": known, "mask": mask}
     for method, options in (("subspace", dict[str, Any]()), ("calibrated", given)):
@@ -290,8 +290,9 @@ def test_kill_and_restart(path: Path, tmp_path: Path) -> None:
     def started(place: Path) -> Program:
         return Program(tmp_path, KILLED, str(path), str(place), str(MEMORY))
 
-    begin = time.monotonic()
-    assert started(tmp_path / "timed.zarr").end() == (0, "")
+    for name in ("first", "timed"):  # the first program waits for the imports
+        begin = time.monotonic()
+        assert started(tmp_path / f"{name}.zarr").end() == (0, "")
     whole, kills = time.monotonic() - begin, 0
     for _ in range(10):
         process = started(target)
