@@ -127,9 +127,9 @@ def test_what_does_not_fit_the_bench_is_named() -> None:
 
 LIMITS = Limits(chunk=30, reserve=0, queue=3)
 SWEEP = from_yaml(
-    replaced(("[300.0, 290.0, 310.0]", "[300.0, 290.0]"), ("duration: 0.15", "duration: 0.6"))
+    replaced(("[300.0, 290.0, 310.0]", "[300.0, 290.0]"), ("duration: 0.15", "duration: 0.3"))
 )
-SCENE = from_yaml(replaced(("duration: 0.15", "duration: 1.2"), text=scene_text()))
+SCENE = from_yaml(replaced(("duration: 0.15", "duration: 0.6"), text=scene_text()))
 
 
 def recorded(folder: Path) -> dict[str, str]:
@@ -167,7 +167,7 @@ def test_a_recording_has_the_same_bytes_under_load_and_on_one_core(tmp_path: Pat
     capture = open_capture(tmp_path / "load" / "scene.zarr")
     assert capture.attrs["started"].startswith(f"{START:%Y-%m-%dT}")
     totals = capture.attrs["totals"]
-    assert {band: total["frames"] for band, total in totals.items()} == {"8-14": 120, "9.5": 121}
+    assert {band: total["frames"] for band, total in totals.items()} == {"8-14": 60, "9.5": 61}
     assert all(total["refused"] == total["lost"] == 0 for total in totals.values())
     if not hasattr(os, "sched_setaffinity"):
         pytest.skip("the system does not bind a process to a core")

@@ -188,7 +188,7 @@ def test_unknown_materials_hold() -> None:
     mixture, rng = emissivity_module.library_mixture(list(RIG.bands)), np.random.default_rng(31)
     parts = mixture["weight"].values, mixture["mean"].values, mixture["covariance"].values
     covers, errors = list[float](), list[list[float]]()
-    while len(covers) < 200:
+    while len(covers) < 100:
         part = rng.choice(parts[0].size, p=parts[0])
         material = rng.multivariate_normal(parts[1][part], parts[2][part])
         if not np.all((material > 0.02) & (material < 0.999)):

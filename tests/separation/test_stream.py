@@ -42,10 +42,18 @@ def glass() -> Data:
     return walkers(3, 30.0)
 
 
-def test_frames_together_are_frames_one_by_one(glass: Data) -> None:
+@pytest.fixture(scope="module")
+def plain(glass: Data) -> tuple[Stream, xr.Dataset]:
+    """Stream that has taken all frames of it, and what it has returned."""
+    return live(*glass[1:])
+
+
+def test_frames_together_are_frames_one_by_one(
+    glass: Data, plain: tuple[Stream, xr.Dataset]
+) -> None:
     """Several frames in one call give the same as one after another, to the last bit."""
     _, capture, response = glass
-    one = live(capture, response)[0]
+    one = plain[0]
     other = Stream(capture.isel(time=[0]), response, frame_rate=RATE, refresh=5.0)
     other.update(capture["time"].values[:77], capture["counts"].values[:, :77])
     result = other.update(capture["time"].values[77:], capture["counts"].values[:, 77:])
@@ -63,14 +71,14 @@ def test_a_long_gap_is_not_smoothed_over(glass: Data) -> None:
     assert held(after, scene, where=result["status"] == 0) > 0.90
 
 
-def test_samples_that_are_nan_stay_nan(glass: Data) -> None:
+def test_samples_that_are_nan_stay_nan(glass: Data, plain: tuple[Stream, xr.Dataset]) -> None:
     """A sample that is NaN has no temperatures; its pixel keeps those of the other frames."""
     _, capture, response = glass
     spoiled = capture.copy(deep=True)
     spoiled["counts"].values[0, 250:252, 3, 4] = np.nan
     spoiled["counts"].values[1, :, 5, 6] = np.nan
     result = live(spoiled, response)[1].sel(time=slice(24.5, 26.0))
-    clean = live(capture, response)[1].sel(time=slice(24.5, 26.0))
+    clean = plain[1].sel(time=slice(24.5, 26.0))
     at = np.isclose(result["time"], 25.0) | np.isclose(result["time"], 25.1)
     pixel = result["object_temperature"][:, 3, 4]
     assert clean["object_temperature"][:, 3, 4].notnull().all()
@@ -97,13 +105,12 @@ def test_memory_does_not_grow_and_the_past_is_forgotten() -> None:
     assert float(off.max()) < 0.05
 
 
-def test_a_shift_of_nothing_changes_nothing(glass: Data) -> None:
+def test_a_shift_of_nothing_changes_nothing(glass: Data, plain: tuple[Stream, xr.Dataset]) -> None:
     """Cameras in one place: the second one's frames are resampled to themselves."""
     _, capture, response = glass
     none = field(np.zeros((2, capture.sizes["y"], capture.sizes["x"])))
-    plain = live(capture, response)[0].result()
     shifted = live(capture, response, reflection_shift=none)[0].result()
-    xr.testing.assert_allclose(shifted, plain, rtol=1e-5)
+    xr.testing.assert_allclose(shifted, plain[0].result(), rtol=1e-5)
 
 
 def test_a_shutter_event_is_told_by_the_segment(glass: Data) -> None:
@@ -177,7 +184,7 @@ def test_rate_of_full_frames() -> None:
 def test_bands_come_by_name_and_masked_samples_are_missing(glass: Data) -> None:
     """Frames whose bands stand the other way, and masked samples, which are as if missing."""
     _, capture, response = glass
-    counts, time = capture["counts"].values, capture["time"].values
+    counts, time = capture["counts"].values[:, :200], capture["time"].values[:200]
     wrong = np.random.default_rng(0).random(counts[:, 0].shape) < 0.02
     kinds: dict[str, list[Any]] = {"plain": [], "named": [], "missing": [], "masked": []}
     for frame in np.moveaxis(counts, 1, 0):
