@@ -1,22 +1,18 @@
 """Commands that are killed, signalled, or started twice: one whole output, nothing beside it."""
 
 import json
-import os
 import signal
 import subprocess
 import sys
 from pathlib import Path
-from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import tifffile
 import xarray as xr
-from forked import Program
 from hostile_files import seed_of_week
 
-from dbthermal import readers, simulation, store
-from dbthermal.__main__ import main
+from dbthermal import simulation, store
 
 COMMANDS = {
     "import": "import a.tif b.tif --bands wide narrow --unit count --clock 10 --offset 0 -o x.zarr",
@@ -30,7 +26,7 @@ COMMANDS = {
 # Before the n-th file operation at the output something is done: a kill, a signal, or a wait; of
 # place 0 their number is printed in the end.
 HOOK = """
-import itertools, os, re, signal, sys
+import atexit, itertools, os, re, signal, sys
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # which nohup ignores
 place, act, number = sys.argv[1], sys.argv[2], itertools.count(1)
 operations = {"open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.link", "os.truncate"}
@@ -43,11 +39,10 @@ def hook(event, arguments):
             else:
                 os.kill(os.getpid(), int(act))
 sys.addaudithook(hook)
-from dbthermal.__main__ import main
-status = main(sys.argv[3:])
 if place == "0":
-    print("operations:", next(number), file=sys.stderr)
-sys.exit(status)
+    atexit.register(lambda: print("operations:", next(number), file=sys.stderr))
+from dbthermal.__main__ import main
+sys.exit(main(sys.argv[3:]))
 """
 
 
@@ -64,17 +59,31 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     store.save(rig.response().assign_coords(band=["wide", "narrow"]), folder / "response.zarr", {})
     for name, counts in zip("ab", capture["counts"].values, strict=True):
         tifffile.imwrite(folder / f"{name}.tif", counts.astype("uint16"), photometric="minisblack")
-    status, error = start(folder, "separate", output="result.zarr").end()
+    status, error = end(start(folder, "separate", output="result.zarr"))
     assert status == 0, error
     assert "no library has emissivities of the bands ['wide', 'narrow']" in error
     return folder
 
 
-def start(folder: Path, command: str, place: int = -1, act: str = "-", output: str = "") -> Program:
+def start(
+    folder: Path, command: str, place: int = -1, act: str = "-", output: str = ""
+) -> subprocess.Popen[str]:
     """Command in a process of its own, which acts at a file operation of its output."""
     words = COMMANDS[command].split()
     words[-1] = output or words[-1]
-    return Program(folder, HOOK, str(place), act, *words, "--overwrite")
+    return started(folder, HOOK, str(place), act, *words, "--overwrite")
+
+
+def started(folder: Path, *words: str) -> subprocess.Popen[str]:
+    """Program in a process of its own."""
+    command, pipe = [sys.executable, "-c", *words], subprocess.PIPE
+    return subprocess.Popen(command, cwd=folder, text=True, stdin=pipe, stdout=pipe, stderr=pipe)
+
+
+def end(process: subprocess.Popen[str]) -> tuple[int, str]:
+    """Exit status of a process, and its errors."""
+    _, error = process.communicate("\n", timeout=600)
+    return process.returncode, error
 
 
 def beside(folder: Path) -> list[str]:
@@ -99,15 +108,15 @@ def test_killed_and_started_again(folder: Path, command: str) -> None:
     Of all operations the first, the last and some others are tried, which differ every week.
     """
     output = COMMANDS[command].split()[-1]
-    status, error = start(folder, command, 0).end()
+    status, error = end(start(folder, command, 0))
     assert status == 0, error
     last = int(error.rpartition("operations: ")[2]) - 1
     clean(folder)
     others = np.random.default_rng(seed_of_week()).integers(2, last, 3 if command in QUICK else 8)
     for place in (1, *others.tolist(), last):
-        status, error = start(folder, command, place, "9").end()
+        status, error = end(start(folder, command, place, "9"))
         assert status in {-9, 0}, error  # by chance of threads one operation may be missing
-        status, error = start(folder, command).end()
+        status, error = end(start(folder, command))
         assert status == 0, error
         assert beside(folder) == [output], place
         if output.endswith(".zarr"):
@@ -119,7 +128,7 @@ def test_killed_and_started_again(folder: Path, command: str) -> None:
 def test_signals_leave_nothing(folder: Path, command: str) -> None:
     """By SIGTERM and SIGHUP a command ends with their status, and with no draft of an output."""
     for number in (signal.SIGTERM, signal.SIGHUP):
-        status, error = start(folder, command, 6, str(int(number))).end()
+        status, error = end(start(folder, command, 6, str(int(number))))
         assert status == 128 + number, error
         # The parts of a run stay; or its thread has just joined them.
         assert {*beside(folder)} <= ({"x.zarr.parts", "x.zarr"} if command == "run" else set())
@@ -137,11 +146,12 @@ def test_signals_leave_nothing(folder: Path, command: str) -> None:
 def test_two_commands_at_one_output(folder: Path, command: str, second: str) -> None:
     """The second is told the process of the first, which ends well."""
     process = start(folder, command, 5, "wait")
-    assert process.read_line() == "waiting\n"
-    status, error = start(folder, second).end()
+    assert process.stdout is not None
+    assert process.stdout.readline() == "waiting\n"
+    status, error = end(start(folder, second))
     assert status == 1
     assert f"Busy output '{folder / 'x.zarr'}': process {process.pid} on " in error
-    assert process.end()[0] == 0
+    assert end(process)[0] == 0
     assert beside(folder) == ["x.zarr"]
     store.open_dataset(folder / "x.zarr").load()
     clean(folder)
@@ -163,45 +173,54 @@ recording.close(time=np.arange(2.0))
 
 def test_two_processes_at_one_recording(folder: Path) -> None:
     """Neither a second recording nor an output replaces one that grows; both say why."""
-    first = Program(folder, RECORDING)
-    assert first.read_line() == "waiting\n"
-    for second in (Program(folder, RECORDING), start(folder, "correct")):
-        status, error = second.end()
+    first = started(folder, RECORDING)
+    assert first.stdout is not None
+    assert first.stdout.readline() == "waiting\n"
+    for second in (started(folder, RECORDING), start(folder, "correct")):
+        status, error = end(second)
         assert status == 1
         assert "Busy output 'x.zarr': a recording writes to it. Must end first" in error
-    assert first.end() == (0, "")
+    assert end(first) == (0, "")
     assert store.open_dataset(folder / "x.zarr").sizes["time"] == 2
     assert beside(folder) == ["x.zarr"]
     clean(folder)
 
 
-def test_control_characters_are_shown(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_control_characters_are_shown(folder: Path) -> None:
     """Names with an escape, a line end or a reversed order of letters do not reach the terminal."""
-    monkeypatch.chdir(folder)
     name = "c\x1b[31m\n\u202e.tif"
     (folder / name).write_bytes((folder / "a.tif").read_bytes())
-    assert main(["info", name, "--unit", "count", "--clock", "10"]) == 0
-    text, error = capsys.readouterr()
-    assert r"c\x1b[31m\n\u202e.tif:" in text
-    assert not {"\x1b", "\u202e"} & {*text, *error}
+    command = [sys.executable, "-m", "dbthermal", "info", name, "--unit", "count", "--clock", "10"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
+    assert r"c\x1b[31m\n\u202e.tif:" in done.stdout
+    assert not {"\x1b", "\u202e"} & {*done.stdout, *done.stderr}
 
 
-def test_too_little_memory_and_dry_runs(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_too_little_memory_and_dry_runs(folder: Path) -> None:
     """Out of memory the output is named, with what it needs; before it is, bytes are told."""
-    monkeypatch.chdir(folder)
+    code = """
+import sys
+from dbthermal import readers
+from dbthermal.__main__ import main
+def two_bands(*_, **__):
+    raise MemoryError("Unable to allocate 1 TB")
+readers.two_bands = two_bands if sys.argv[1] == "short" else readers.two_bands
+sys.exit(main(sys.argv[2:]))
+"""
     words = COMMANDS["import"].split()
-    assert main([*words, "--dry-run", "--json"]) == 0
-    planned = json.loads(capsys.readouterr().out)
+    short = subprocess.run(
+        [sys.executable, "-c", code, "short", *words],
+        cwd=folder, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert short.returncode == 1
+    assert "Out of memory, 'x.zarr' is not written: Unable to allocate 1 TB. Must" in short.stderr
+    dry = subprocess.run(
+        [sys.executable, "-c", code, "dry", *words, "--dry-run", "--json"],
+        cwd=folder, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    planned = json.loads(dry.stdout)
     assert 2 * 64 * 8 * 12 * 2 <= planned["would_write_bytes_at_most"] < 30_000
     assert planned["free_bytes"] > 0
-    monkeypatch.setattr(readers, "two_bands", Mock(side_effect=MemoryError("Cannot have 1 TB")))
-    assert main(words) == 1
-    error = capsys.readouterr().err
-    assert "Out of memory, 'x.zarr' is not written: Cannot have 1 TB. Must" in error
     assert beside(folder) == []
 
 
@@ -223,10 +242,7 @@ def test_second():
     pass
 """)
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "."]
-    alone = {**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
-    done = subprocess.run(
-        command, cwd=tmp_path, env=alone, capture_output=True, text=True, check=False
-    )
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert "ended by SIGTERM" in done.stdout
     assert "1 passed" in done.stdout

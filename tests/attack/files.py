@@ -1,6 +1,7 @@
 """Stores of which a bit is flipped, and processes that are killed while they save."""
 
 import itertools
+import multiprocessing
 import os
 import re
 import shutil
@@ -14,7 +15,6 @@ from typing import Any, Final
 import numpy as np
 import xarray as xr
 import zarr
-from forked import CONTEXT
 from hostile_files import record
 
 from attack.damage import Rng, Table, hurt
@@ -212,7 +212,9 @@ def kills(rng: Rng) -> Attack:
 
 def _end(path: Path, place: int) -> None:
     """Run a process that saves until its n-th file operation, and kill it so."""
-    process = CONTEXT.Process(target=_run, args=(path, place))
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([__name__])
+    process = context.Process(target=_run, args=(path, place))
     process.start()
     process.join(_DEADLINE)
     if process.exitcode is None:

@@ -1,5 +1,6 @@
 """A recording after a kill or a power loss opens, with all frames but the last chunk's."""
 
+import multiprocessing
 import os
 import signal
 import stat
@@ -13,7 +14,6 @@ import pytest
 import xarray as xr
 from faulty_camera import BANDS, two_bands, two_cameras
 from file_operations import before_operation, operations_of
-from forked import CONTEXT
 from rig_session import LIMIT
 from test_capture_file import CaptureFile, Note, begun, shot
 
@@ -56,8 +56,10 @@ def record_until_killed(folder: Path, share: float, pipe: Connection) -> None:
 
 def killed(folder: Path, share: float) -> list[int]:
     """Kill a recording after a part of it; frames that it had taken by then."""
-    ours, theirs = CONTEXT.Pipe(duplex=False)
-    process = CONTEXT.Process(target=record_until_killed, args=(folder, share, theirs))
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([__name__, "dbthermal.store", "dbthermal.instruments.recording"])
+    ours, theirs = context.Pipe(duplex=False)
+    process = context.Process(target=record_until_killed, args=(folder, share, theirs))
     process.start()
     theirs.close()
     taken = [0, 0]

@@ -1,5 +1,6 @@
 """Cache of experiments: a result is computed once, and again if code or file changed."""
 
+import multiprocessing
 import os
 import time
 import zlib
@@ -9,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from forked import CONTEXT
 
 from reproduction import cache
 
@@ -65,7 +65,7 @@ def result_of(folder: str) -> xr.Dataset:
 
 def test_two_processes_at_once(tmp_path: Path, marks: Path) -> None:
     """Each has a whole result, and one of them is kept, with nothing beside it."""
-    with ProcessPoolExecutor(2, CONTEXT) as pool:
+    with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
         results = list(pool.map(result_of, [str(marks)] * 2))
     assert not results[0].identical(results[1])
     (kept,) = (path for path in (tmp_path / "kept").rglob("*") if path.is_file())
