@@ -2,11 +2,11 @@
 
 import warnings
 from collections.abc import Iterator
+from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
-from scenes import Shelf
 from scipy.interpolate import interp1d
 from worlds import RESPONSE, SHAPE, World, seen
 
@@ -80,15 +80,8 @@ CLOCKS = [name for name in WORLDS if WORLDS[name][0].clocks]
 LEAST, FEW, MOST_RMSE, MOST_FAR = 0.9, 0.05, 1.3, 1e-3
 
 
-Figures = tuple[float, float, float, tuple[str, ...]]
-
-
-def outcome(shelf: Shelf, name: str, seed: int) -> Figures:
-    """Figures of a situation, of which all workers make each once."""
-    return shelf.kept(f"world, {name} {seed}".replace("/", " over "), lambda: figures(name, seed))
-
-
-def figures(name: str, seed: int) -> Figures:
+@cache
+def outcome(name: str, seed: int) -> tuple[float, float, float, tuple[str, ...]]:
     """Share of the intervals that hold, share and RMSE [K] of pixels without a flag, warnings."""
     capture, truth = seen(WORLDS[name][0], seed)
     with warnings.catch_warnings():
@@ -105,9 +98,9 @@ def figures(name: str, seed: int) -> Figures:
     valid = np.isfinite(error).all(axis=1)  # frames before and after the other camera's
     error, std = error[valid], std[valid]
     holds = np.abs(error) < 1.96 * std
-    shares = float(holds.mean()), float(sound.mean()), float(np.sqrt(np.mean(error**2)))
-    print(name, seed, *(f"{figure:.3f}" for figure in shares))
-    return *shares, tuple(result.attrs.get("warnings", []))
+    figures = float(holds.mean()), float(sound.mean()), float(np.sqrt(np.mean(error**2)))
+    print(name, seed, *(f"{figure:.3f}" for figure in figures))
+    return *figures, tuple(result.attrs.get("warnings", []))
 
 
 def cases() -> Iterator[Any]:
@@ -119,22 +112,22 @@ def cases() -> Iterator[Any]:
 
 
 @pytest.mark.parametrize(("name", "seed"), [*cases()])
-def test_intervals_hold(shelf: Shelf, name: str, seed: int) -> None:
+def test_intervals_hold(name: str, seed: int) -> None:
     """In 9 of 10 samples without a flag; what is mended is nearly as good as without."""
-    holds, share, rmse, _ = outcome(shelf, name, seed)
+    holds, share, rmse, _ = outcome(name, seed)
     without = WORLDS[name][2]
     assert holds >= LEAST or share <= FEW
-    assert not without or rmse <= MOST_RMSE * outcome(shelf, without, seed)[2]
+    assert not without or rmse <= MOST_RMSE * outcome(without, seed)[2]
 
 
 @pytest.mark.parametrize("name", [name for name in QUICK if WORLDS[name][1]])
-def test_what_is_mended_is_said(shelf: Shelf, name: str) -> None:
+def test_what_is_mended_is_said(name: str) -> None:
     """The warning names the cause."""
-    assert any(WORLDS[name][1] in line for line in outcome(shelf, name, 1)[3])
+    assert any(WORLDS[name][1] in line for line in outcome(name, 1)[3])
 
 
 @pytest.mark.parametrize("name", ["fabrics", "cameras shake", "lenses blur unlike"])
-def test_lost_frames_and_dead_pixels_spoil_nothing(shelf: Shelf, name: str) -> None:
+def test_lost_frames_and_dead_pixels_spoil_nothing(name: str) -> None:
     """Values have deviations, and what is mended is as good as without them."""
     capture, truth = seen(WORLDS[name][0], 2)
     lost, dead = [0, 40, 41, 42, 200], np.random.default_rng(5).random(SHAPE) < 0.02
@@ -150,7 +143,7 @@ def test_lost_frames_and_dead_pixels_spoil_nothing(shelf: Shelf, name: str) -> N
         np.testing.assert_array_equal(result[f"{film}_std"].isnull().values, lacking)
     sound = result["status"].values == 0
     error = (result["object_temperature"].values - truth)[:, sound]
-    assert np.sqrt(np.nanmean(error**2)) <= MOST_RMSE * outcome(shelf, name, 2)[2]
+    assert np.sqrt(np.nanmean(error**2)) <= MOST_RMSE * outcome(name, 2)[2]
     assert any(WORLDS[name][1] in line for line in result.attrs.get("warnings", [""]))
 
 
