@@ -83,9 +83,8 @@ def test_maps_are_cut_by_rows(path: Path, tmp_path: Path) -> None:
     target = tmp_path / "result.zarr"
     separation.run(path, target, response, "calibrated", memory=MEMORY, **maps)
     expected = separation.solve(store.open_dataset(path).load(), response, "calibrated", **maps)
-    xr.testing.assert_identical(
-        store.open_dataset(target).load().drop_attrs(), expected.drop_attrs()
-    )
+    result = store.open_dataset(target).load()
+    xr.testing.assert_identical(result.drop_attrs(), expected.drop_attrs())
 
 
 def peak(source: Path, target: Path, memory: float) -> float:
