@@ -10,7 +10,7 @@ HOUSE = Path(dbthermal.__file__).parent
 
 # Lines and modules that a room may have. A room that grows takes from another; these only fall.
 BUDGET = {
-    "": (3474, 15),
+    "": (3475, 15),
     "_cli": (1251, 5),
     "alignment": (2848, 10),
     "calibration": (738, 2),
@@ -22,11 +22,11 @@ BUDGET = {
     "limits": (659, 2),
     "readers": (2768, 10),
     "reporting": (362, 1),
-    "separation": (12743, 48),
+    "separation": (12740, 48),
     "simulation": (523, 1),
     "store": (1366, 6),
 }
-INSTALLED = 35_868  # lines of all rooms
+INSTALLED = 35_866  # lines of all rooms
 
 PRONOUNS = {
     *("one", "other", "others", "own", "part", "parts", "some", "here", "there", "told", "known"),
