@@ -65,7 +65,7 @@ class Subspace:
 
 
 def leading(samples: npt.NDArray[Any], count: int, slow: Array | None = None) -> Array:
-    """Orthonormal functions of time that hold most of samples (pixel, time), outside slow ones."""
+    """Orthonormal functions (time, function) of most of samples (pixel, time), less slow ones."""
     sample = np.asarray(samples[:: max(1, len(samples) // (_FOR_EACH * count))], np.float64)
     sample = sample if slow is None else sample - sample @ slow @ slow.T
     if len(sample) < sample.shape[1]:

@@ -22,6 +22,7 @@ from dbthermal import schema
 from dbthermal._arrays import Array, empty, quotient, release, select
 from dbthermal._samples import without_gaps
 from dbthermal.separation import _misfit as misfits
+from dbthermal.separation._apart.equations import smooth_functions
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._misfit import Misfit, Reading
 
@@ -83,7 +84,7 @@ def equalise(
         return None
     # Smooth functions of time, fitted to the frames with samples, hold the object and its details.
     measured, frames = corrected["counts"], np.ones(corrected.sizes["time"], dtype=bool)
-    functions = misfits.smooth_functions(inputs, frames).astype(np.float32)
+    functions = smooth_functions(inputs.capture, frames).functions.astype(np.float32)
     counts = empty(measured.shape, np.float32)
     maps = np.empty((len(counts), functions.shape[1], *counts.shape[2:]))
     for band, film in enumerate(counts):
@@ -232,7 +233,7 @@ def _equations(
     within = ndimage.maximum_filter(ratio, _BORDER) < _ALIKE * least
     used &= within | (np.count_nonzero(used & within) < _MOSTLY * np.count_nonzero(used))
     blurs = max(excess, 0.0), max(-excess, 0.0)
-    basis = misfits.smooth_functions(inputs, frames)
+    basis = smooth_functions(inputs.capture, frames).functions
     # Leading functions of time hold most of the rapid changes, at less cost.
     if leading is not None:
         changes = smooth.leading(select(films[0], pixels).T, leading, basis)

@@ -13,7 +13,7 @@ from dbthermal.noise import MAD
 from dbthermal.schema import Status
 from dbthermal.separation._tiles import RANGE_SIGMAS
 
-_FRAMES: Final = 200  # frames and pixels, about, that are judged by the response
+_FRAMES: Final = 50  # frames and pixels, about, that are judged by the response
 _PIXELS: Final = 2_500
 _OUTSIDE: Final = 0.01  # share of samples outside the calibration that gives a warning
 _HARDLY: Final = 0.2  # share of moving pixels without a flag; below, 50 to 82 % of intervals hold

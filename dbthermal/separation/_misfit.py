@@ -26,6 +26,7 @@ from dbthermal import schema
 from dbthermal._arrays import Array, Mask, quotient, release, stretches
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._apart import planes
+from dbthermal.separation._apart.equations import smooth_functions
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._quality import MOST_BRIDGED
 from dbthermal.separation._subspace.fused import FILMS
@@ -208,8 +209,8 @@ def _of_rows(
     single = _single_pixels(inputs, signals, weights, frames, place, number.size)
     release()
     # Take the smooth functions out, for changes and for events, and sum over means and events.
-    basis, noise = smooth_functions(inputs, frames), _block_sums(noise, width)
-    filled = np.maximum(number, 1.0)
+    basis = smooth_functions(inputs.capture, frames).functions
+    noise, filled = _block_sums(noise, width), np.maximum(number, 1.0)
     remainder, variances = _means(inputs, number, noise, sums, basis)[::2]
     mean_weights, mean_noise = _block_sums(weights, width) / filled, noise[0] / filled**2
     levels = _levels(mean_weights, mean_noise, remainder, frames, shape)
@@ -352,12 +353,6 @@ def reflected(inputs: Inputs, result: xr.Dataset, rows: slice) -> Reading:
     return Reading(rows, signals, reflections, frames, pixels, gain)
 
 
-def smooth_functions(inputs: Inputs, frames: Mask) -> Array:
-    """Smooth functions (frame, number), and steps of shutter events, over some frames (time)."""
-    time = inputs.capture["time"].values[frames].astype(np.float64)
-    return smooth.largest(time, schema.segments(inputs.capture)[frames]).functions
-
-
 def object_weights(inputs: Inputs, result: xr.Dataset) -> Array:
     """Weights (band, y, x) of the bands, in their order, for the object's signal."""
     ratio = result["reflection_ratio"].values[inputs.bands]
@@ -402,7 +397,7 @@ def widen(inputs: Inputs, result: xr.Dataset, misfit: Misfit) -> None:
     curve = inputs.curves[first]
     for row in map(int, np.flatnonzero(sound.any(axis=1))):
         columns = np.flatnonzero(sound[row])
-        chosen = [film[:, row, columns].astype(np.float64) for film in films]
+        chosen = [film[:, row].take(columns, axis=1).astype(np.float64) for film in films]
         leak, change = misfit.leak[row, columns], everything[row, columns]
         share = emissivity[row, columns]
         counted = np.isfinite(chosen[0]).sum(axis=0)

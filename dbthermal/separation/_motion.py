@@ -30,8 +30,9 @@ from dbthermal import _smooth as smooth
 from dbthermal._arrays import Array, Mask, quotient
 from dbthermal._samples import without_gaps
 from dbthermal.schema import Status
+from dbthermal.separation._apart.equations import smooth_functions
 from dbthermal.separation._inputs import Inputs
-from dbthermal.separation._misfit import Misfit, Reading, Whole, object_weights, smooth_functions
+from dbthermal.separation._misfit import Misfit, Reading, Whole, object_weights
 from dbthermal.separation._overlay import (
     PARAMETERS,
     SURE,
@@ -181,7 +182,7 @@ def _rapid(corrected: xr.Dataset, inputs: Inputs) -> Array:
     if np.count_nonzero(frames) < inputs.method.minimum_frames:
         return motion
     windows = list(_windows(films, inputs, frames))
-    basis = smooth_functions(inputs, frames)
+    basis = smooth_functions(inputs.capture, frames).functions
     prior = _COMMON**2 * np.ones((len(bands), len(bands))) + _APART**2 * np.eye(len(bands))
     precision = np.kron(np.linalg.inv(prior), np.eye(PARAMETERS))
     path = np.zeros((len(bands), len(basis), PARAMETERS))
@@ -334,7 +335,7 @@ def drift(inputs: Inputs, result: xr.Dataset, reading: Reading) -> list[tuple[Ar
     ratios = result["reflection_ratio"].values[inputs.bands, reading.rows].astype(np.float64)
     pixels = reading.pixels.reshape(ratios.shape[1:])
     # Only rapid changes have a part in the equations.
-    basis = smooth_functions(inputs, reading.frames)
+    basis = smooth_functions(inputs.capture, reading.frames).functions
     # Rapid changes in some frames, and in those before and after them.
     at = np.arange(1, len(basis) - 1, -(-len(basis) // _FRAMES))
     course = _course(inputs.capture["time"].values.astype(np.float64))[reading.frames][at]

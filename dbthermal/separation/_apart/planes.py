@@ -182,8 +182,9 @@ def project(inputs: Inputs, result: xr.Dataset, emissivity: Floats, threads: Exe
                     for band, changes in enumerate(more, 1):
                         straight[band][:, places] += inverse @ changes
                 without_object(signals, x, shares, responses)
-                for band, signal in enumerate(signals):
-                    maps[band][:, row, column] = quick.T @ signal
+                for images, signal in zip(maps.reshape(*maps.shape[:2], -1), signals, strict=True):
+                    for image, values in zip(images, quick.T @ signal, strict=True):
+                        image[places] = values  # all at once take four times as long
                 noise[0][:, row, column] = tile.scaled(tile.noise)
                 freedom[row, column] = np.sum(quick**2, dtype=np.float64)
                 usable[row, column] = True

@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from dbthermal import response as responses
 from dbthermal import schema
-from dbthermal._arrays import Array, Mask, release
+from dbthermal._arrays import Array, Mask, release, select
 from dbthermal.noise import MAD
 from dbthermal.separation._inputs import Labels
 
@@ -80,7 +80,7 @@ def reflected_difference(result: xr.Dataset, bands: list[int], of: Mask) -> tupl
     films = [result[f"background_temperature{name}"].values for name in ("", "_std")]
     frames, (excess, deviation) = len(films[0]), np.zeros((2, *of.shape))
     for row in np.flatnonzero(of.any(axis=1)):
-        film, std = (array[:, row, of[row]] for array in films)
+        film, std = (select(array[:, row], of[row]) for array in films)
         # Sorted along contiguous samples: far faster than a median along the first axis.
         ordered = np.sort(film.T.copy(), axis=1)
         # The background at rest, which makes no edges.

@@ -467,8 +467,8 @@ def hold(
     # Mean square D of the objects' difference, in deviations of the pixel alone.
     square, variance = np.zeros((2, *common.shape))
     sampled = slice(None, None, max(1, len(single) // _FRAMES))
-    for row, columns in enumerate(sound & valid):
-        samples = (film[sampled, row, columns] for film in (*films, single))
+    for row, columns in enumerate(map(np.flatnonzero, sound & valid)):
+        samples = (film[sampled, row].take(columns, axis=1) for film in (*films, single))
         value, lone, std = (sample.astype(np.float64) for sample in samples)
         square[row, columns] = np.nanmean(((value - lone) / std) ** 2, axis=0)
         variance[row, columns] = np.nanmean(std**2, axis=0)
@@ -484,14 +484,13 @@ def hold(
     mean = _neighbour_mean(square * variance, common | (stay & sound))
     constant = np.where(valid & ~sound, mean, 0.0)
     factor, film = square * common, pooled["object_temperature_std"].values
-    names = [name for name, variable in per_pixel.items() if "x" in variable.dims]
-    maps = [(pooled[name].values, per_pixel[name].values) for name in names]
+    maps = [(pooled[it].values, data.values) for it, data in per_pixel.items() if "x" in data.dims]
     wider = (factor > 0) | (constant > 0)
     for row in map(int, np.flatnonzero((wider | stay).any(axis=1))):
         columns, alike = np.flatnonzero(wider[row]), np.flatnonzero(stay[row])
-        added = factor[row, columns] * np.nan_to_num(single[:, row, columns]) ** 2
-        added += constant[row, columns]
-        film[:, row, columns] = np.sqrt(film[:, row, columns] ** 2 + added)
+        lone, std = (array[:, row].take(columns, axis=1) for array in (single, film))
+        added = factor[row, columns] * np.nan_to_num(lone) ** 2 + constant[row, columns]
+        film[:, row, columns] = np.sqrt(std**2 + added)
         for target, variable in maps:
             target[..., row, alike] = variable[..., row, alike]
         film[:, row, alike] *= np.sqrt(1.0 + unlike[row, alike])
