@@ -203,7 +203,7 @@ OPTIONAL: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
             "exposure_time": EXPOSURE_TIME,
             "frame_flags": FRAME_FLAGS,
             "segment": SEGMENT,
-            "drift": _of("band time", "count", "drift that was removed"),
+            "drift": _of("band time", "count", "drift of the band's level that was subtracted"),
             "noise_factor": NOISE_FACTOR,
             "pattern_std": PATTERN_STD,
             "status": STATUS,
@@ -229,8 +229,8 @@ OPTIONAL: Final[Mapping[str, Mapping[str, Variable]]] = MappingProxyType(
         "correction": {
             "bad": _of("band y x", "1", "bad pixel", "bool"),
             "residual": _of("band", "count", "RMS residual over the good pixels"),
-            "level": _of("band temperature", "count", "mean over the good pixels"),
-            "offset_std": _of("band", "count", "standard deviation of the offset at the centre"),
+            "level": _of("band temperature", "count", "mean blackbody signal of the good pixels"),
+            "offset_std": _of("band", "count", "offset's standard deviation at level 'centre'"),
             "gain_std": _of("band", "1", "standard deviation of the gain"),
             "centre": _of("band", "count", "level where offset and gain errors are independent"),
         },
@@ -318,7 +318,7 @@ class Status(Flags):
     OUTSIDE_RESPONSE = 1 << 9, "a temperature outside the calibrated range of the response"
     DEAD_PIXEL = 1 << 10, "bad pixel, marked by the correction"
     FROZEN_FRAMES = 1 << 11, "the same counts in a band for several frames in a row"
-    NOT_CONVERGED = 1 << 12, "the optimiser stopped at its limit of steps or at no finite value"
+    NOT_CONVERGED = 1 << 12, "the iteration did not converge, or its result is not a finite number"
     OBJECT_JUMP = 1 << 13, "sudden steps of the object, part of its curve; the values are valid"
     BANDS_APART = 1 << 14, "rapid changes differ between the bands: time offset or parallax"
     ROLES_MAY_BE_SWAPPED = 1 << 15, "object and background may be exchanged in the result"
