@@ -573,6 +573,7 @@ def test_refusals_are_one_line(results: Path) -> None:
         said(results, *command, "--traceback")
     for wrong in (["separate", "scene.zarr"], ["complete", *"abc", "--surroundings", "22"], ["no"]):
         assert said(results, *wrong)[0] == 2
+    assert run(results, "nothing").returncode == 2
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from attack.containers import BOMBS, FALSE, TRUE, container
 from attack.oracle import Attack, Verdict, carry_out
 from attack.runner import CLASSES, Worker, attack_all, bad, table
 
-SHORT, WEEKLY, LONG = 200, 800, 6000
+SHORT, WEEKLY, LONG = 200, 1500, 6000
 """Inputs of the quick tests, of the slow ones, which are others every week, and of the long one."""
 
 
@@ -54,7 +54,7 @@ def test_each_container(name: str) -> None:
 def test_many_attacks(number: int, seed: int) -> None:
     """99 % of the inputs end well, and of the pixels without a flag at most 0.1 % are wrong.
 
-    Of 800 inputs, which are too few for the second, at most 0.5 % are silent, and the share of
+    Of 1,500 inputs, which are too few for the second, at most 0.5 % are silent, and the share of
     pixels is not surely above it: wrong pixels come by inputs, so the sum of their squares is the
     variance of their number.
     """
