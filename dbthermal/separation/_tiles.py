@@ -51,6 +51,10 @@ BROKEN: Final = np.uint32(Status.OBJECT_NOT_SMOOTH | Status.BANDS_APART)
 LOW, LEAST_MEAN = np.uint32(Status.ROLES_MAY_BE_SWAPPED), 0.5
 """Flag of low emissivities, and the mean of the bands below which they are."""
 
+# In simulated worlds 92 and 96 % of 24 materials hold by 12 and 16, 79 by 4, 88 by 8 or 32.
+SPANS: Final = 16
+"""Spans of time that each tell an emissivity's error."""
+
 _MAPS: Final = ("emissivity", "reflection_ratio")
 WITHOUT_STD: Final = ("object_temperature_std", "background_temperature_std", "emissivity_std")
 """Variables that a method without standard deviations never estimates."""
@@ -109,13 +113,14 @@ class Survey(Pixels):
     emissivity: Array  # of the first band, of the pixel alone (pixel) [1]; NaN where undefined
     noise_variance: Array  # its variance from the noise, independent of other pixels' (pixel) [1]
     drift_variance: Array  # its variance from the background, common to all pixels (pixel) [1]
+    influence: Array  # of the reflections in each span of time on it (span, pixel) [1]
 
     @classmethod
     def empty(cls, bands: int, pixels: int) -> Self:
         """Survey of pixels that tell nothing."""
         scatter, frames = np.zeros((3, bands, bands, pixels)), np.zeros((3, pixels))
         vectors, numbers = np.full((2, bands, pixels), np.nan), np.full((3, pixels), np.nan)
-        return cls(scatter, frames, *vectors, *numbers)
+        return cls(scatter, frames, *vectors, *numbers, np.zeros((SPANS, pixels)))
 
 
 @dataclass(frozen=True)

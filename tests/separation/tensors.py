@@ -23,7 +23,7 @@ from dbthermal.separation._subspace import (
     regression,
 )
 from dbthermal.separation._subspace.fused import FILMS, Solution
-from dbthermal.separation._tiles import Tile
+from dbthermal.separation._tiles import SPANS, Tile
 
 Tensor = torch.Tensor
 Work = SimpleNamespace
@@ -281,8 +281,9 @@ def _alternate(model: Model, material: Known, work: Work) -> None:
     for _ in range(pixel.ROUNDS):
         work.emitted = _blackbody(model, temperature, 0)[0]
         slope = _regress(work, float(model.noise[0]))
-        least = pixel.OBJECT_TO_NOISE * work.used * work.null_variance
-        work.constant = (work.energy < least) & ~fixed
+        noise = work.used * work.null_variance
+        work.constant = (work.energy < pixel.OBJECT_TO_NOISE * noise) & ~fixed
+        slope = slope * (1.0 + noise * work.weights.mean(dim=0) / work.energy)
         rate = (slope - slope_before) / (first - before)
         rate = rate.where(rate.abs() < pixel.FASTEST, 0.0)
         before, slope_before = first, slope
@@ -301,6 +302,12 @@ def _emission(model: Model, material: Known, work: Work) -> None:
     kernel = weights * emitted
     kernel = (kernel - weights * (kernel.sum(0) / weights.sum(0))) / work.energy
     noise_variance = work.line_variance + first**2 * _curve_variance(model, work, kernel)
+    off = (1.0 - (work.residual / (regression.TUNING * work.scale)) ** 2).clip(min=0.0)
+    square = (emitted - (weights * emitted).sum(0) / weights.sum(0)) ** 2
+    steepness = (off * (5.0 * off - 4.0) * square).sum(0).clip(min=0.5 * work.energy)
+    edges = np.arange(SPANS + 1) * len(z) // SPANS
+    spans = _block_sums(kernel * work.residual, edges) * work.energy / steepness
+    work.influence = spans.where(~work.known, 0.0)
     walk, upper = _walk(model, work)
     limit = (1.0 - first) * model.drift
     change = emitted.amax(dim=0) - emitted.amin(dim=0)

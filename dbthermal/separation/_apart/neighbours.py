@@ -31,7 +31,7 @@ from dbthermal.separation._pooling.pool import Image
 from dbthermal.separation._quality import Bits
 from dbthermal.separation._subspace.bars import NORMAL95
 from dbthermal.separation._subspace.reflection_ratio import energy_of_variance, principal_ratio
-from dbthermal.separation._tiles import BROKEN, LOW, Mask, Material, Survey
+from dbthermal.separation._tiles import BROKEN, LOW, SPANS, Mask, Material, Survey
 
 BLUR: Final = 1.0
 """Deviation of the blur of the bands whose ratios are compared [pixel]."""
@@ -144,6 +144,7 @@ def _survey(
         emissivity=value,
         noise_variance=np.ones(places.size),
         drift_variance=np.zeros(places.size),
+        influence=np.zeros((SPANS, places.size)),
     )
 
 

@@ -43,7 +43,6 @@ _MOSTLY: Final = 0.5  # share of gray pixels from which their material is [1]
 _UNLIKELY, _UNLIKELY_MEAN = 4.0, 1.5
 # Deviation of the neighbourhood that shares such errors [pixel], and its least weight [1].
 _VICINITY, _LEAST_WEIGHT = 1.5, 1e-3
-_SQUARE: Final = 8  # side [pixel] of what mirrors the same people at the same time
 _FRAMES: Final = 64  # that tell how much an object differs, about
 
 _OUTLIER_SIGMAS: Final = 4.0  # deviations beyond which a pixel is not of the material
@@ -391,20 +390,16 @@ def _material(image: Image, common: Material, labels: Labels, survey: Survey) ->
     scatter = total(where, weight**2 * residual, count) / whole**2
     scatter *= pixels / np.maximum(pixels - 1, 1)
     expected = total(where, weight**2 * noise, count) / whole**2
-    # Neighbours mirror the same people: var(mean) = sum_s (sum_i w (e - mean))^2 n / (n - 1) of n
-    # squares s (Liang, Zeger 1986, doi:10.1093/biomet/73.1.13).
-    rows, columns = np.divmod(image.surveyed, image.width)
-    squares = rows // _SQUARE * (image.width // _SQUARE + 1) + columns // _SQUARE
-    groups = np.where(valid, where + count * squares, -1)
-    sums = total(groups, weight * (value - mean[where]), count * (1 + int(squares.max())))
-    sums = sums.reshape(-1, count)
-    number = (sums != 0).sum(axis=0)
-    clustered = (sums**2).sum(axis=0) / whole**2 * number / np.maximum(number - 1, 1)
-    scatter = np.maximum(scatter, clustered)
+    # All pixels mirror the same people: var(mean) = sum_s (sum_i w k_s)^2 n / (n - 2) of n spans of
+    # time, of the residual's influence k in each (Liang, Zeger 1986, doi:10.1093/biomet/73.1.13),
+    # beside that of the noise (Cameron et al. 2011, doi:10.1198/jbes.2010.07136).
+    spans = [total(where, weight * np.nan_to_num(each), count) for each in survey.influence]
+    timed = np.var(spans, axis=0) * len(spans) ** 2 / (len(spans) - 2) / whole**2
+    common_error = np.maximum(timed - expected, 0.0)
     result = replace(
         common,
         emissivity=image.expand(mean),
-        noise_variance=image.expand(np.maximum(scatter, expected)),
+        noise_variance=image.expand(np.maximum(scatter, expected) + common_error),
         drift_variance=image.expand(total(where, weight * drift, count) / whole),
     )
     return _graded(image, result, where, (value - mean[where], noise, weight))

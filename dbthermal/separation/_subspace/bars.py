@@ -165,6 +165,7 @@ def bars(model: Model, record: Any, line: Line, work: Work, covariance: Any) -> 
     if not line.known:
         for t in range(z.size):
             kernel[t] = weights[t] * (emitted[t] - product / total) / line.energy
+        regression.influence(emitted, work.residual, weights, line.scale, record.influence)
         noise_variance = line.variance
         noise_variance += first**2 * _curve_variance(model, kernel, count, null, work)
         limit = (1.0 - first) * model.drift

@@ -61,6 +61,7 @@ class Solution(Pixels):
     epsilon_variance: Array  # of the error of the null combination's ratios (pixel) [1]
     noise_variance: Array  # of e_1, from the regression's noise (pixel) [1]
     drift_variance: Array  # of e_1, from the background's slow part (pixel) [1]
+    influence: Array  # of the residual in each span of time on e_1 (span, pixel) [1]
     constant: Mask  # the object changes too little for its emissivity (pixel)
     restless: Mask  # the background hardly rests (pixel)
     gray: Mask  # the signals as they are may be those of a gray body (pixel)
@@ -80,6 +81,7 @@ class Solution(Pixels):
             emissivity=np.where(plain, self.emissivity[0], np.nan),
             noise_variance=self.noise_variance,
             drift_variance=self.drift_variance,
+            influence=self.influence,
         )
 
 
@@ -112,6 +114,7 @@ RECORD: Final = np.dtype(
         *((name, np.float64) for name in _NUMBERS),
         *((name, np.bool_) for name in ("pooled", "gray", "constant", "restless", "unexplained")),
         *((name, np.float64, 2) for name in ("missing", "lost")),
+        ("influence", np.float64, tiles.SPANS),
         # There are no arrays of truth values in a record.
         *[("order", np.intp), ("freedom", np.intp, 3), ("beyond", np.intp, 2)],
     ]
