@@ -120,7 +120,8 @@ class Survey(Pixels):
         """Survey of pixels that tell nothing."""
         scatter, frames = np.zeros((3, bands, bands, pixels)), np.zeros((3, pixels))
         vectors, numbers = np.full((2, bands, pixels), np.nan), np.full((3, pixels), np.nan)
-        return cls(scatter, frames, *vectors, *numbers, np.zeros((SPANS, pixels)))
+        arrays = scatter, frames, *vectors, *numbers, np.zeros((SPANS, pixels))
+        return cls(*arrays)
 
 
 @dataclass(frozen=True)

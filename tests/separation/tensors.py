@@ -281,9 +281,8 @@ def _alternate(model: Model, material: Known, work: Work) -> None:
     for _ in range(pixel.ROUNDS):
         work.emitted = _blackbody(model, temperature, 0)[0]
         slope = _regress(work, float(model.noise[0]))
-        noise = work.used * work.null_variance
-        work.constant = (work.energy < pixel.OBJECT_TO_NOISE * noise) & ~fixed
-        slope = slope * (1.0 + noise * work.weights.mean(dim=0) / work.energy)
+        least = pixel.OBJECT_TO_NOISE * work.used * work.null_variance
+        work.constant = (work.energy < least) & ~fixed
         rate = (slope - slope_before) / (first - before)
         rate = rate.where(rate.abs() < pixel.FASTEST, 0.0)
         before, slope_before = first, slope
@@ -305,7 +304,7 @@ def _emission(model: Model, material: Known, work: Work) -> None:
     off = (1.0 - (work.residual / (regression.TUNING * work.scale)) ** 2).clip(min=0.0)
     square = (emitted - (weights * emitted).sum(0) / weights.sum(0)) ** 2
     steepness = (off * (5.0 * off - 4.0) * square).sum(0).clip(min=0.5 * work.energy)
-    edges = np.arange(SPANS + 1) * len(z) // SPANS
+    edges = torch.arange(SPANS + 1) * len(z) // SPANS
     spans = _block_sums(kernel * work.residual, edges) * work.energy / steepness
     work.influence = spans.where(~work.known, 0.0)
     walk, upper = _walk(model, work)
@@ -446,9 +445,14 @@ def _regress(work: Work, noise: float) -> Tensor:
         residual = _first_residual(work.emitted, z, noise)
     else:
         residual = _fit(work.emitted, z, work.weights)[2]
-    for _ in range(regression.STEPS):
+    for step in range(1, regression.STEPS + 1):
         scale = (regression.TO_STD * _ranked_magnitude(residual)).clip(min=noise)
         weights = _tukey(residual, scale)
+        if step == regression.STEPS:  # none beside points without, if half is kept
+            lost, width = (weights == 0.0).double().T, 1 + 2 * regression.EDGE
+            lost = torch.nn.functional.max_pool1d(lost, width, 1, regression.EDGE).T
+            kept = weights.where(lost == 0.0, 0.0)
+            weights = kept.where(kept.sum(dim=0) >= 0.5 * weights.sum(dim=0), weights)
         slope, _, residual, energy = _fit(work.emitted, z, weights)
     # var(slope) = s^2 / sum w (x - mean)^2, over the fraction of independent points.
     kept = residual * weights

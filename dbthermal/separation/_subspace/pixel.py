@@ -356,10 +356,7 @@ def emission(model: Model, record: Any, work: Work, rounds: int) -> Line:
             work.emitted, z, work.noise[0], weights, work.residual, work.few, is_started
         )
         is_started = True
-        noise = count * record.null_variance
-        constant = energy < OBJECT_TO_NOISE * noise and not fixed
-        # The noise of the abscissa, a part of its energy, makes the line as much less steep.
-        slope += slope * noise * kernels.mean(weights) / energy
+        constant = energy < OBJECT_TO_NOISE * count * record.null_variance and not fixed
         rate = (slope - slope_before) / (emissivity - before)
         before, slope_before = emissivity, slope
         emissivity = material[1] if fixed else middle if constant else slope
