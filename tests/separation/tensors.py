@@ -301,11 +301,11 @@ def _emission(model: Model, material: Known, work: Work) -> None:
     kernel = weights * emitted
     kernel = (kernel - weights * (kernel.sum(0) / weights.sum(0))) / work.energy
     noise_variance = work.line_variance + first**2 * _curve_variance(model, work, kernel)
-    off = (1.0 - (work.residual / (regression.TUNING * work.scale)) ** 2).clip(min=0.0)
-    square = (emitted - (weights * emitted).sum(0) / weights.sum(0)) ** 2
-    steepness = (off * (5.0 * off - 4.0) * square).sum(0).clip(min=0.5 * work.energy)
+    inside = (1.0 - (work.residual / (regression.TUNING * work.scale)) ** 2).clip(min=0.1)
+    centred = emitted - (weights * emitted).sum(0) / weights.sum(0)
+    steepness = (kernel * centred * (5.0 - 4.0 / inside)).sum(0).clip(min=0.5)
     edges = torch.arange(SPANS + 1) * len(z) // SPANS
-    spans = _block_sums(kernel * work.residual, edges) * work.energy / steepness
+    spans = _block_sums(kernel * work.residual, edges) / steepness
     work.influence = spans.where(~work.known, 0.0)
     walk, upper = _walk(model, work)
     limit = (1.0 - first) * model.drift

@@ -13,7 +13,7 @@ from worlds import MARGIN, RESPONSE, SHAPE, World, seen
 
 from dbthermal import alignment, separation, simulation
 from dbthermal.schema import Status
-from dbthermal.separation._apart import relaxation
+from dbthermal.separation._apart import equations
 from dbthermal.separation._apart.equations import Equations
 from reproduction.experiments.pictures import Picture, smooth_shift
 
@@ -190,5 +190,5 @@ def test_the_object_of_both_places_solves_the_equations() -> None:
 def test_an_iteration_without_end_changes_no_sample() -> None:
     """An object that grows without bound at one place leaves the other camera's samples."""
     signals, result = np.array([[[0.0, 0.0]], [[0.5, 1e4]]]), np.empty((1, 2))
-    relaxation.changes(signals, np.arange(2), np.array([0.5, 0.5]), np.zeros(9), result)
+    equations.changes(signals, np.arange(2), np.array([0.5, 0.5]), np.zeros(9), result)
     np.testing.assert_allclose(result, [[0.25, 0.0]])

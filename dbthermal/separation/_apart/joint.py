@@ -31,9 +31,9 @@ from dbthermal import _smooth as smooth
 from dbthermal._arrays import copied, release
 from dbthermal.schema import Status
 from dbthermal.separation._apart import equations as system
-from dbthermal.separation._apart import neighbours, relaxation
+from dbthermal.separation._apart import neighbours
+from dbthermal.separation._apart.equations import Floats
 from dbthermal.separation._apart.planes import Planes
-from dbthermal.separation._apart.relaxation import Floats
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._subspace import regression
 from dbthermal.separation._subspace.reflection_ratio import null_combination
@@ -122,7 +122,7 @@ class Joint:
         bends = system.bends(tuple(self.inputs.curves[band] for band in self.inputs.bands))
         changes = np.empty((len(bends), signals.shape[1], pixels.size), np.float32)
         for film, share, bend in zip(changes, self.emissivity[1:, pixels], bends, strict=True):
-            relaxation.changes(signals, pixels, share, bend, film)
+            system.changes(signals, pixels, share, bend, film)
         return changes if weights is None else weights[frames] @ changes
 
     def finish(self, result: xr.Dataset, threads: Executor) -> None:
@@ -200,7 +200,7 @@ def solve(
         pooled = material is not None and np.isfinite(material.emissivity).any()
         sampled = frames.nodes if pooled and frames.smooth else looked_at(result.sizes["time"])
         places = equations.solved
-        change = system.change(inputs, equations.ways[relaxation.LOOSE], result, threads)
+        change = system.change(inputs, equations.ways[system.LOOSE], result, threads)
         shares = system.coefficients(inputs, raw, solved)[:, places]
         # Of a smooth object the combination without background is that of the maps, at a material's
         # ratios; else that of the result, which takes x(p) for x(r) or holds `before`.
@@ -261,7 +261,7 @@ def _spread(films: Floats, step: Floats, equations: system.Equations) -> tuple[F
     """Signals (2, node, pixel) [K] of solved pixels, and the pixels that go on moving."""
     signals = np.full((*films.shape[:2], equations.first.size), np.nan, np.float32)
     signals[..., equations.solved] = np.where(np.abs(films) > USELESS, np.nan, films)
-    return signals, equations.spread(step > 10.0 * relaxation.CONVERGED)
+    return signals, equations.spread(step > 10.0 * system.CONVERGED)
 
 
 Target: TypeAlias = Callable[[Whole], tuple[Floats, Floats]]
@@ -346,7 +346,7 @@ def _by_film(
         signal = np.asarray(curve.signal(film[at][:, places]) - curve.reference)
         signal = np.ascontiguousarray(signal.T, dtype=np.float32)
         second = np.empty(signal.shape)
-        relaxation.other_bands(np.ascontiguousarray(shares[1:]), equations.bends, signal, second)
+        system.other_bands(np.ascontiguousarray(shares[1:]), equations.bends, signal, second)
         q = shares[0][:, np.newaxis] * signal
         q += second
         if before is not None:  # part of q that the inputs of the result were without

@@ -23,8 +23,8 @@ from dbthermal._arrays import Array
 from dbthermal._samples import neighbour_mean
 from dbthermal.schema import Status
 from dbthermal.separation._apart import equations as system
+from dbthermal.separation._apart.equations import Floats
 from dbthermal.separation._apart.planes import TAIL, Planes, Scatters
-from dbthermal.separation._apart.relaxation import Floats
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._pooling import pool
 from dbthermal.separation._pooling.pool import Image

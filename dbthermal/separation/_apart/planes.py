@@ -26,7 +26,7 @@ from dbthermal.response import Curve
 from dbthermal.separation import _quality as quality
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._apart import equations as system
-from dbthermal.separation._apart.relaxation import Floats
+from dbthermal.separation._apart.equations import Floats
 from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._subspace import reflection_ratio
 from dbthermal.separation._subspace.kernels import polynomial

@@ -163,9 +163,11 @@ def bars(model: Model, record: Any, line: Line, work: Work, covariance: Any) -> 
     first, noise_variance, drift_variance = work.emissivity[0], work.material[2], work.material[3]
     walk, upper = _walk(model, first**2 * null, count, work)
     if not line.known:
+        middle = product / total
         for t in range(z.size):
-            kernel[t] = weights[t] * (emitted[t] - product / total) / line.energy
-        regression.influence(emitted, work.residual, weights, line.scale, record.influence)
+            kernel[t] = weights[t] * (emitted[t] - middle) / line.energy
+        spread = middle, line.scale
+        regression.influence(emitted, work.residual, kernel, spread, record.influence)
         noise_variance = line.variance
         noise_variance += first**2 * _curve_variance(model, kernel, count, null, work)
         limit = (1.0 - first) * model.drift

@@ -72,28 +72,23 @@ def bisquare(off: float) -> float:
 
 
 @compiled
-def influence(x: Array, residual: Array, weights: Array, scale: float, spans: Array) -> None:
-    r"""Errors of a slope by the residuals in each span of time, in place.
+def influence(x: Array, residual: Array, kernel: Array, line: Any, spans: Array) -> None:
+    r"""Errors of a slope, :math:`\sum_t k z`, by the residuals in each span of time, in place.
 
-    With the bisquare's :math:`\psi = w r` they are
-    :math:`\sum_t (x - \bar x) \psi / \sum_t (x - \bar x)^2 \psi'`
-    (Huber 1981, doi:10.1002/0471725250).
+    With the bisquare's :math:`\psi = w r` they are, of x about its mean,
+    :math:`\sum_t x \psi / \sum_t x^2 \psi'` (Huber 1981, doi:10.1002/0471725250).
+    The line has the mean of x, and the scale of the residual.
     """
-    total, product, energy, least = 0.0, 0.0, 0.0, 0.0
-    for t in range(x.size):
-        total += weights[t]
-        product += weights[t] * x[t]
-    middle, inverse = product / total, 1.0 / (TUNING * scale)
+    steepness, (middle, scale) = 0.0, line
+    inverse = 1.0 / (TUNING * scale)
     for span in range(spans.size):
-        moment = 0.0
+        spans[span] = 0.0
         for t in range(span * x.size // spans.size, (span + 1) * x.size // spans.size):
-            inside, square = max(1.0 - (residual[t] * inverse) ** 2, 0.0), (x[t] - middle) ** 2
-            energy += inside * (5.0 * inside - 4.0) * square
-            least += 0.5 * weights[t] * square
-            moment += weights[t] * (x[t] - middle) * residual[t]
-        spans[span] = moment
+            inside = max(1.0 - (residual[t] * inverse) ** 2, 0.1)
+            steepness += kernel[t] * (x[t] - middle) * (5.0 - 4.0 / inside)
+            spans[span] += kernel[t] * residual[t]
     for span in range(spans.size):
-        spans[span] /= max(energy, least)
+        spans[span] /= max(steepness, 0.5)
 
 
 @compiled
