@@ -12,11 +12,11 @@ import numpy as np
 import xarray as xr
 
 from dbthermal import _numbers, _samples, alignment, schema
-from dbthermal._arrays import without_blas_threads
+from dbthermal._arrays import Array, empty, release, without_blas_threads
 from dbthermal.alignment._planes import Scale, displaced_windows
 from dbthermal.alignment._reflections import seen_apart
 from dbthermal.bands import FILTERS
-from dbthermal.emissivity import colour_of
+from dbthermal.emissivity import Colour, colour_of
 from dbthermal.schema import Status, warned
 from dbthermal.separation import _budget as budget
 from dbthermal.separation import _misfit as misfits
@@ -33,7 +33,6 @@ from dbthermal.separation._overlay import overlay
 from dbthermal.separation._pooling import materials as pooling
 from dbthermal.separation._pooling.pool import hold
 from dbthermal.separation._quality import MOST_BRIDGED
-from dbthermal.separation._reflection import as_gray, restored
 from dbthermal.separation._solve import get_method, require_whole, separated
 from dbthermal.separation._tiles import Material
 
@@ -60,6 +59,9 @@ _SOME, _LESS = 0.05, 0.5
 # Delay beside a shift from which clocks are compared [frame], and in deviations: of cameras of one
 # clock 0.012 at most, of clocks half a frame or more apart 0.4 to 0.9.
 _LATE, _SIGMAS = 0.05, 3.0
+# Rounds in which scales of a reflection of a colour are found, and their change that moves no
+# object: 0.05 % of 20 K are 0.01 K.
+_SCALINGS, _SETTLED = 5, 5e-4
 
 
 @without_blas_threads
@@ -170,7 +172,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
         misfit = replace(misfit, change=np.hypot(misfit.change, detail))
         mended = laid.sentences() + mended
     if colour is not None:
-        capture, scale, (measured, misfit) = as_gray(capture, once, measured, colour)
+        capture, scale, (measured, misfit) = _as_gray(capture, once, measured, colour)
     result, materials = measured.result, measured.materials
     misfits.widen(measured.inputs, result, misfit)
     # Complete what is still unknown.
@@ -182,7 +184,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
         doubts.append(_NOT_COMPLETED.format(names))
         result = budget.added(result, measured.inputs)
     if colour is not None:
-        result = restored(result, scale, colour)
+        result = _restored(result, scale, colour)
     if materials is not None:
         result["material"] = materials
     source = "none" if measured.reflection_shift is None else "found"
@@ -319,6 +321,52 @@ def _separated(
     if materials is not None:
         hold(per_pixel, result, materials, apart=reflection_shift is not None)
     return Measured(result, inputs, materials, reflection_shift, doubts)
+
+
+def _as_gray(
+    corrected: xr.Dataset,
+    once: Callable[[xr.Dataset], tuple[Measured, Any]],
+    measured: Measured,
+    colour: Colour,
+) -> tuple[xr.Dataset, Array, tuple[Measured, Any]]:
+    """Scale a capture to a gray background; return it, the scales s, and the separation with it."""
+    inputs, level, scale = measured.inputs, colour.level, colour.scale(measured.result)
+    if level is None:
+        films = measured.result["background_temperature"].values
+        films = films[:, measured.result["status"].values == 0]
+        level = float(np.nanmedian(films)) if films.size else inputs.curves[0].reference
+    # The emissivities, from which s follows, are at first those of the signals as they are.
+    for _ in range(_SCALINGS):
+        counts = empty(corrected["counts"].shape, np.float32)
+        for band, curve in enumerate(inputs.curves):
+            rest, share = np.float32(curve.counts(level)), np.float32(scale[band])
+            for frame, image in zip(counts[band], corrected["counts"].values[band], strict=True):
+                frame[:] = rest + (image - rest) / share
+            release()
+        # Noise and pattern are divided as in most pixels.
+        capture = corrected.assign(counts=corrected["counts"].copy(data=counts))
+        capture = capture.assign_attrs(background_colour=colour)
+        for name in {"noise_factor", *({"pattern_std"} & {*corrected})}:
+            before = corrected[name].values if name in corrected else 1.0
+            capture[name] = "band", before / np.median(scale, axis=(1, 2))
+        outcome = once(capture)
+        used, scale = scale, colour.scale(outcome[0].result, scale)
+        if np.mean(np.abs(scale - used)) < _SETTLED:
+            break
+    return capture, used, outcome
+
+
+def _restored(result: xr.Dataset, scale: Array, colour: Colour) -> xr.Dataset:
+    """Result of scaled signals with the emissivities, ratios and noise of those before."""
+    g = colour.ratio[:, np.newaxis, np.newaxis]
+    of_std, of_ratio = (np.where(scale == 1.0, 1.0, s) for s in (scale**2 / g, scale / g))
+    factors = {"emissivity": scale, "reflection_ratio": of_ratio, "reflection_ratio_std": of_ratio}
+    factors |= dict.fromkeys(("emissivity_std", "emissivity_uncertainty"), of_std)
+    factors["emissivity_covariance"] = of_std[:, np.newaxis] * of_std
+    factors["noise"] = np.median(scale, axis=(1, 2))
+    for name in factors.keys() & {*map(str, result.data_vars)}:
+        result[name].values[...] *= factors[name].astype(result[name].dtype)
+    return result
 
 
 def check_stated(

@@ -3,11 +3,11 @@ r"""Materials of a capture, found from a first separation, to pool a second one 
 Of one pixel the reflection ratio :math:`k_m = (1-e_m)/(1-e_{ref})` of its material is known to a
 few percent only. So the maps propose and the statistics decide:
 
-1. `feature_maps` cuts the image into cells, along the edges of the ratio and of the difference of
+1. `segmentation` cuts the image into cells, along the edges of the ratio and of the difference of
    the bands' mean signals, in which the object's temperature shows far less than its emissivity.
 2. A cell whose ratios scatter more than their deviations allow lies across a border, and is cut.
 3. Neighbours whose pooled ratios and emissivities agree are joined, the most alike first
-   (`region_merging`), as long as a difference that matters would be seen.
+   (`segmentation`), as long as a difference that matters would be seen.
 4. A cell whose own ratio is too uncertain, as where nothing moved, joins a neighbour towards which
    the maps have no step.
 5. After a first pooling (`joined`), so do regions between which the pixels' own ratios show no
@@ -31,8 +31,8 @@ from dbthermal import response as responses
 from dbthermal._arrays import Array, Mask
 from dbthermal.schema import Status, laid_on
 from dbthermal.separation._inputs import Labels
-from dbthermal.separation._pooling import feature_maps, gradients, region_merging
-from dbthermal.separation._pooling.region_merging import Features, Regions
+from dbthermal.separation._pooling import gradients, segmentation
+from dbthermal.separation._pooling.segmentation import Features, Regions
 from dbthermal.separation._subspace.reflection_ratio import ratio_variance
 from dbthermal.separation._tiles import Material
 
@@ -139,18 +139,18 @@ def materials(
         frames = slice(first[count.argmax()], (first + count)[count.argmax()])  # it only rises
         corrected, result = corrected.isel(time=frames), result.isel(time=frames)
     bands, noise = _bands(result, response)
-    means, variances, change = feature_maps.mean_signals(corrected, response, bands, noise)
+    means, variances, change = segmentation.mean_signals(corrected, response, bands, noise)
     (ratios, features), share = _features(result, bands), _sharing(result)
     valid = np.all(np.isfinite(means), axis=0) & (result["status"].values & int(_UNUSABLE) == 0)
     cells = _cells(ratios, means, variances, valid, error_rate)
     regions = Regions(cells, features, error_rate, share)
-    pairs = region_merging.neighbours(cells)
+    pairs = segmentation.neighbours(cells)
     regions.join_alike(pairs, resolution)
     # Pairs whose ratios could not show a difference are compared by what they emit.
     roots = regions.roots()[pairs]
     vague = (roots[:, 0] != roots[:, 1]) & (regions.compare(*roots.T)[1] > resolution)
     seen = np.isin(cells, pairs[vague])
-    reflected, reflected_variance = feature_maps.reflected_difference(result, bands, seen)
+    reflected, reflected_variance = segmentation.reflected_difference(result, bands, seen)
     emitted = means[1:] - means[0] - reflected
     variance = variances[1:] + variances[0] + reflected_variance
     linked, steps = _links(cells, pairs[vague], emitted, variance, change)
@@ -189,7 +189,7 @@ def others(labels: xr.DataArray, result: xr.Dataset) -> xr.DataArray:
     """Materials (y, x), and connected pixels without a material as further labels."""
     telling = int(_UNUSABLE | Status.NO_BACKGROUND_MOTION)  # else it would agree with any
     free = (labels.values < 0) & ((result["status"].values & telling) == 0)
-    regions = feature_maps.connected(free.astype(np.intp)) * free
+    regions = segmentation.connected(free.astype(np.intp)) * free
     regions[np.bincount(regions.ravel())[regions] < _SMALLEST] = 0
     numbers = np.unique(regions, return_inverse=True)[1].reshape(regions.shape)
     return labels.copy(data=np.where(numbers > 0, labels.values.max() + numbers, labels))
@@ -208,7 +208,7 @@ def joined(
     arrays = pooled.ratio[1:], variance[1:], *emissivity
     features = _both(*(array.reshape(-1, *cells.shape) for array in arrays))
     merged = Regions(cells, replace(features, common=np.ones_like(features.common)), _ERROR_RATE)
-    pairs = region_merging.neighbours(cells)
+    pairs = segmentation.neighbours(cells)
     # A material is cut where ratios of single pixels are biased by what their order leaves of the
     # object; pooled ratios are not.
     merged.join_alike(pairs, _RESOLUTION)
@@ -229,8 +229,8 @@ def joined(
             regions = roots == first, roots == second
             ratios, both = (array.window(window) for array in maps)
             # Regions without a step are joined too, as where an emissivity changes over a body.
-            same = region_merging.alike(*regions, ratios, both)
-            if same and region_merging.continuous(*regions, both, _RESOLUTION, reach):
+            same = segmentation.alike(*regions, ratios, both)
+            if same and segmentation.continuous(*regions, both, _RESOLUTION, reach):
                 merged.join(first, second)
                 grown = True
     return _labelled(cells, merged, per_pixel)
@@ -289,15 +289,15 @@ def _cells(
     ratios: Features, means: Array, variances: Array, valid: Mask, error_rate: float
 ) -> Labels:
     """Cells (y, x) that are not seen to lie across a border, or are of the smallest size."""
-    strength = feature_maps.edges(
+    strength = segmentation.edges(
         np.concatenate([ratios.values, means[1:] - means[0]]),
         np.concatenate([ratios.variances, variances[1:] + variances[0]]),
     )
-    cells = feature_maps.superpixels(strength, valid, _SPACINGS[0])
+    cells = segmentation.superpixels(strength, valid, _SPACINGS[0])
     for spacing in _SPACINGS[1:]:
-        mixed = region_merging.mixed(cells, ratios, error_rate)[cells]
-        finer = cells.max() + feature_maps.superpixels(strength, valid, spacing)
-        cells = feature_maps.connected(np.where(mixed, finer, cells))
+        mixed = segmentation.mixed(cells, ratios, error_rate)[cells]
+        finer = cells.max() + segmentation.superpixels(strength, valid, spacing)
+        cells = segmentation.connected(np.where(mixed, finer, cells))
     return cells
 
 

@@ -166,8 +166,7 @@ def bars(model: Model, record: Any, line: Line, work: Work, covariance: Any) -> 
         middle = product / total
         for t in range(z.size):
             kernel[t] = weights[t] * (emitted[t] - middle) / line.energy
-        spread = middle, line.scale
-        regression.influence(emitted, work.residual, kernel, spread, record.influence)
+        regression.influence(emitted, work.residual, kernel, (middle, line.scale), record.influence)
         noise_variance = line.variance
         noise_variance += first**2 * _curve_variance(model, kernel, count, null, work)
         limit = (1.0 - first) * model.drift
