@@ -301,12 +301,8 @@ def _emission(model: Model, material: Known, work: Work) -> None:
     kernel = weights * emitted
     kernel = (kernel - weights * (kernel.sum(0) / weights.sum(0))) / work.energy
     noise_variance = work.line_variance + first**2 * _curve_variance(model, work, kernel)
-    inside = (1.0 - (work.residual / (regression.TUNING * work.scale)) ** 2).clip(min=0.1)
-    centred = emitted - (weights * emitted).sum(0) / weights.sum(0)
-    steepness = (kernel * centred * (5.0 - 4.0 / inside)).sum(0).clip(min=0.5)
     edges = torch.arange(SPANS + 1) * len(z) // SPANS
-    spans = _block_sums(kernel * work.residual, edges) / steepness
-    work.influence = spans.where(~work.known, 0.0)
+    work.influence = _block_sums(kernel * work.residual, edges).where(~work.known, 0.0)
     walk, upper = _walk(model, work)
     limit = (1.0 - first) * model.drift
     change = emitted.amax(dim=0) - emitted.amin(dim=0)

@@ -12,7 +12,7 @@ from dbthermal.separation._subspace import kernels, regression
 from dbthermal.separation._subspace.kernels import compiled, inlined
 from dbthermal.separation._subspace.pixel import Line, Model, Work, combined
 from dbthermal.separation._subspace.reflection_ratio import CHANCE
-from dbthermal.separation._tiles import Whole
+from dbthermal.separation._tiles import SPANS, Whole
 
 # The background counts as resting within so many standard deviations, in that share of frames.
 WITHIN: Final = 3.0
@@ -163,10 +163,11 @@ def bars(model: Model, record: Any, line: Line, work: Work, covariance: Any) -> 
     first, noise_variance, drift_variance = work.emissivity[0], work.material[2], work.material[3]
     walk, upper = _walk(model, first**2 * null, count, work)
     if not line.known:
-        middle = product / total
         for t in range(z.size):
-            kernel[t] = weights[t] * (emitted[t] - middle) / line.energy
-        regression.influence(emitted, work.residual, kernel, (middle, line.scale), record.influence)
+            kernel[t] = weights[t] * (emitted[t] - product / total) / line.energy
+        for span in range(SPANS):
+            for t in range(span * z.size // SPANS, (span + 1) * z.size // SPANS):
+                record.influence[span] += kernel[t] * work.residual[t]
         noise_variance = line.variance
         noise_variance += first**2 * _curve_variance(model, kernel, count, null, work)
         limit = (1.0 - first) * model.drift

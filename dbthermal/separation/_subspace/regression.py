@@ -21,8 +21,8 @@ ANNEALING: Final = 0.7
 STARTING_STEPS: Final = 5
 STARTING_POINTS: Final = 128
 STEPS: Final = 3
-# Frames on either side of a reflection that hold its edge: by 0, 1, 2, 3 and 5 emissivities of 24
-# materials in simulated worlds are .28, .17, .11, .09 and .08 thousandths off.
+# Frames on either side of a reflection that hold its edge: by 0, 1, 2, 3 and 5, and true objects,
+# emissivities of 24 materials in simulated worlds are .28, .17, .11, .09 and .08 thousandths off.
 EDGE: Final = 2
 # Largest correlation of neighbouring residuals: a wholly slow residual would have 1.
 MOST_CORRELATED: Final = 0.98
@@ -69,26 +69,6 @@ def bisquare(off: float) -> float:
     """Tukey's weight of a residual over the tuning constant times the scale, 0 beyond 1."""
     inside = max(1.0 - off * off, 0.0)
     return inside * inside
-
-
-@compiled
-def influence(x: Array, residual: Array, kernel: Array, line: Any, spans: Array) -> None:
-    r"""Errors of a slope, :math:`\sum_t k z`, by the residuals in each span of time, in place.
-
-    With the bisquare's :math:`\psi = w r` they are, of x about its mean,
-    :math:`\sum_t x \psi / \sum_t x^2 \psi'` (Huber 1981, doi:10.1002/0471725250).
-    The line has the mean of x, and the scale of the residual.
-    """
-    steepness, (middle, scale) = 0.0, line
-    inverse = 1.0 / (TUNING * scale)
-    for span in range(spans.size):
-        spans[span] = 0.0
-        for t in range(span * x.size // spans.size, (span + 1) * x.size // spans.size):
-            inside = max(1.0 - (residual[t] * inverse) ** 2, 0.1)
-            steepness += kernel[t] * (x[t] - middle) * (5.0 - 4.0 / inside)
-            spans[span] += kernel[t] * residual[t]
-    for span in range(spans.size):
-        spans[span] /= max(steepness, 0.5)
 
 
 @compiled
