@@ -156,6 +156,22 @@ def test_lenses_that_blur_unlike_leave_the_ratio(seed: int) -> None:
     assert float(ratio.median()) == pytest.approx((1 - 0.72) / (1 - 0.86), rel=5e-3)
 
 
+@pytest.mark.slow
+def test_materials_are_as_certain_as_they_say() -> None:
+    """Emissivities of two materials before people; without the part by a drift."""
+    world, scores = World(), []
+    for seed in range(1, 9):
+        result = separation.separate(seen(world, seed)[0], RESPONSE)
+        steady = separation.without_calibration(result, drift=False)
+        steady = steady.where(steady["status"] == 0)
+        for columns, pair in zip((slice(25), slice(46, None)), world.surface, strict=True):
+            middle = steady.isel(x=columns).median(("y", "x"))
+            scores.append((middle["emissivity"] - pair) / middle["emissivity_std"])
+    score = float(np.mean(np.square(scores)) ** 0.5)
+    print(f"errors of materials: {score:.2f} deviations (root mean square)")
+    assert 0.7 < score < 1.4
+
+
 def test_nothing_is_far_off_at_a_border_of_materials() -> None:
     """What a lens mixes is in the error bars, of quiet cameras, too."""
     capture, truth = seen(World(noise=QUIET, blur=(0.6, 0.6)), 1)
