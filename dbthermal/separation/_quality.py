@@ -9,6 +9,7 @@ import numpy.typing as npt
 import xarray as xr
 
 from dbthermal import _samples as samples
+from dbthermal import _smooth as smooth
 from dbthermal import schema
 from dbthermal._arrays import Array, Mask, stride
 from dbthermal.schema import Status
@@ -186,8 +187,13 @@ def sample(corrected: xr.Dataset, pixels: int) -> tuple[Array, Mask]:
     # Good pixels have no bit but that of frozen frames.
     good = (status & ~np.uint32(Status.FROZEN_FRAMES)) == 0
     frames = np.mean(valid[:, good], axis=1) > MOST_MISSING if np.any(good) else good[:0]
-    good &= np.all(valid[frames], axis=0) if np.any(good) else False
-    return counts[:, frames][:, :, good], frames
+    whole = good & np.all(valid[frames], axis=0) if np.any(good) else good
+    if whole.any() or not good.any():
+        return counts[:, frames][:, :, whole], frames
+    # Where no pixel has all of these frames, those that lack few are bridged.
+    good &= np.mean(valid[frames], axis=0) > 1.0 - MOST_BRIDGED
+    films = np.where(valid, counts, np.nan)[:, frames][:, :, good]
+    return np.stack([smooth.bridge(film, good[good]) for film in films]), frames
 
 
 def _frozen(same: list[Mask], valid: Mask, chances: list[float]) -> tuple[Mask, Mask]:
