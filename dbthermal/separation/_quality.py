@@ -175,7 +175,7 @@ def common_frames(
     return [(frames, complete)] if np.any(complete) else []
 
 
-def sample(corrected: xr.Dataset, pixels: int) -> tuple[Array, Mask]:
+def sample(corrected: xr.Dataset, pixels: int, *, bridged: bool = False) -> tuple[Array, Mask]:
     """Counts (band, time, pixel) [count] of about so many good pixels, and their frames (time)."""
     length = corrected.sizes["time"]
     if length > _LONG:  # the step is rounded down: up to four times as many pixels are read
@@ -188,9 +188,9 @@ def sample(corrected: xr.Dataset, pixels: int) -> tuple[Array, Mask]:
     good = (status & ~np.uint32(Status.FROZEN_FRAMES)) == 0
     frames = np.mean(valid[:, good], axis=1) > MOST_MISSING if np.any(good) else good[:0]
     whole = good & np.all(valid[frames], axis=0) if np.any(good) else good
-    if whole.any() or not good.any():
+    if whole.any() or not (bridged and good.any()):
         return counts[:, frames][:, :, whole], frames
-    # Where no pixel has all of these frames, those that lack few are bridged.
+    # Where no pixel has all of these frames, those that lack few are bridged, if asked.
     good &= np.mean(valid[frames], axis=0) > 1.0 - MOST_BRIDGED
     films = np.where(valid, counts, np.nan)[:, frames][:, :, good]
     return np.stack([smooth.bridge(film, good[good]) for film in films]), frames

@@ -270,7 +270,7 @@ def responses_of(curves: tuple[Curve, ...]) -> Response:
 def _functions(inputs: Inputs) -> Array:
     """Functions (time, function) of most of the rapid changes of the reference band."""
     capture = inputs.capture
-    counts, frames = quality.sample(capture, _SAMPLE)
+    counts, frames = quality.sample(capture, _SAMPLE, bridged=True)
     basis = system.smooth_functions(capture, frames).functions
     signals = counts[inputs.bands[0]]
     rapid = smooth.leading(signals.T, _PLANES, basis)
