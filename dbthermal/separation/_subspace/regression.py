@@ -154,9 +154,9 @@ def _started(x: Array, y: Array, noise: float, few: Any) -> tuple[float, float]:
 
 @compiled
 def _weigh(x: Array, y: Array, line: Any, scale: float, weights: Array, off: Array) -> None:
-    """Weights of points by a line, in place: none beside points without, if half is kept.
+    """Weights of points by a line, in place; none for neighbours of outliers, if half is kept.
 
-    A reflection's edge is soft: what is left of it beside its middle is no noise.
+    A reflection's edge is soft: frames next to it still hold some of it, which is no noise.
     """
     inverse, last, whole, kept = 1.0 / (TUNING * scale), x.size - 1, 0.0, 0.0
     for t in range(x.size):
@@ -205,9 +205,9 @@ def regress(
         residual[t] = y[t] - intercept - slope * x[t]
     kept, lagged = (residual[0] * weights[0]) ** 2, 0.0
     for t in range(1, x.size):
-        one = residual[t] * weights[t]
-        kept += one * one
-        lagged += one * residual[t - 1] * weights[t - 1]
+        weighted = residual[t] * weights[t]
+        kept += weighted * weighted
+        lagged += weighted * residual[t - 1] * weights[t - 1]
     correlation = min(max(lagged / kept if kept > 0 else 0.0, 0.0), MOST_CORRELATED)
     # Of residuals of lag-one correlation rho only (1 - rho) / (1 + rho) of the points count.
     independent = (1.0 - correlation) / (1.0 + correlation)
