@@ -59,7 +59,7 @@ def seed_of_week() -> int:
     return int(os.environ.get("DBTHERMAL_SEED") or 100 * year + week)
 
 
-def written(path: Path, content: bytes) -> Path:
+def written(path: Path, content: bytes | bytearray) -> Path:
     """File of a content."""
     path.write_bytes(content)
     return path

@@ -2,11 +2,17 @@
 
 import re
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import pytest
 
 REFUSALS = (KeyError, TypeError, ValueError)
+
+
+def raising(message: str | None) -> AbstractContextManager[object]:
+    """Context in which a ValueError with a message is raised, or nothing where there is none."""
+    return pytest.raises(ValueError, match=message) if message else nullcontext()
 
 
 def refused(

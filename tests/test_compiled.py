@@ -1,8 +1,8 @@
 """Compiled code is kept from process to process, by the code alone; damaged, it is made anew."""
 
-import importlib.util
 import os
 import re
+import runpy
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -154,14 +154,10 @@ def test_threads_that_need_the_same_code_at_once(tmp_path: Path) -> None:
     """Each thread gets its result, whichever of them compiles."""
     text = "\n".join(f"def f{n}(x):\n    return x.sum() + {n}\n" for n in range(6))
     (tmp_path / "sums.py").write_text(text)
-    spec = importlib.util.spec_from_file_location("sums", tmp_path / "sums.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    functions = runpy.run_path(str(tmp_path / "sums.py"))
     arrays = [np.ones(3, kind) for kind in ("f4", "f8", "i4", "i8")] * 2
     with ThreadPoolExecutor(len(arrays)) as pool:
         for n in range(6):
-            function = compiled(getattr(module, f"f{n}"))
+            function = compiled(functions[f"f{n}"])
             assert [*pool.map(function, arrays)] == [3.0 + n] * len(arrays)
     assert len([*tmp_path.rglob("*.nbc")]) == 6 * 4

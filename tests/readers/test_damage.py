@@ -11,15 +11,12 @@ from typing import Any
 
 import hostile_files as hostile
 import pytest
+from marks import long, slow
 
 from dbthermal import readers
 from reproduction import libraries
 
-SIZES = [
-    100,
-    pytest.param(1000, marks=pytest.mark.slow),
-    pytest.param(10_000, marks=pytest.mark.long),
-]
+SIZES = [100, *slow(1000), *long(10_000)]
 """Damaged files of a form: the same few in the quick tests, others every week in the slow ones."""
 
 

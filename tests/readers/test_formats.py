@@ -3,16 +3,13 @@
 from pathlib import Path
 from typing import Any
 
-import h5py
 import hostile_files as hostile
 import imagecodecs
 import numpy as np
 import pytest
-import tifffile
 import xarray as xr
 import zarr
-from flir_files import scene, sequence
-from hostile_files import hcc, sfmov
+from flir_files import scene
 from numpy.testing import assert_array_equal
 
 from dbthermal import readers
@@ -30,13 +27,10 @@ def info(capsys: pytest.CaptureFixture[str], *words: Any) -> tuple[int, str]:
 
 def test_commands_read_by_first_bytes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """HDF5, TIFF, PNG, FLIR, Telops and zarr of any name open by one command, with their times."""
-    with h5py.File(tmp_path / "a.hdf", "w") as file:
-        file["frames"] = scene()
-    tifffile.imwrite(tmp_path / "a.dat", scene(), photometric="minisblack")
+    forms = {"a.hdf": "h5", "a.dat": "tif", "b.bin": "seq", "b.hcc": "hcc", "b.sfmov": "sfmov"}
+    for name, form in forms.items():
+        hostile.write(tmp_path / name, form)
     (tmp_path / "a1.bin").write_bytes(imagecodecs.png_encode(scene()[0]))
-    (tmp_path / "b.bin").write_bytes(sequence(scene()))
-    (tmp_path / "b.hcc").write_bytes(hcc(scene()))
-    (tmp_path / "b.sfmov").write_bytes(sfmov(scene()))
     zarr.create_array(tmp_path / "a.zarr", data=scene())
     film = xr.DataArray(scene(), dims=("time", "y", "x"), name="frames")
     moments = np.datetime64("2026-01-01", "ns") + np.arange(3) * np.timedelta64(100, "ms")
@@ -116,10 +110,8 @@ def test_another_reader_is_named(tmp_path: Path) -> None:
     """A file of a format that another reader opens says which; a folder is named by its files."""
     with pytest.raises(ValueError, match=r"Invalid folder .* Must be files: .*/\*\.tif"):
         readers.tiff(tmp_path, unit="count", clock=10.0)
-    np.save(tmp_path / "a.npy", scene())
-    (tmp_path / "a.seq").write_bytes(sequence(scene()))
-    (tmp_path / "a.hcc").write_bytes(hcc(scene()))
-    tifffile.imwrite(tmp_path / "a.tif", scene(), photometric="minisblack")
+    for form in ("npy", "seq", "hcc", "tif"):
+        hostile.write(tmp_path / f"a.{form}", form)
     for name, wrong, right in (
         ("a.npy", readers.tiff, "array"),
         ("a.seq", readers.array, "flir"),

@@ -5,10 +5,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import pytest
-from hostile_files import ecostress
+from hostile_files import ecostress, written
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
+from refused import refused
 
 from dbthermal import readers
 from reproduction import libraries
@@ -18,9 +19,7 @@ def library_file(
     folder: Path, wavelength: Sequence[float], reflectance: Sequence[float], newline: str = "\n"
 ) -> Path:
     """Write a spectrum as the library does."""
-    path = folder / "glass.spectrum.txt"
-    path.write_bytes(ecostress(wavelength, reflectance, newline))
-    return path
+    return written(folder / "glass.spectrum.txt", ecostress(wavelength, reflectance, newline))
 
 
 @pytest.mark.parametrize("newline", ["\n", "\r\n"])
@@ -99,9 +98,8 @@ def test_ecostress_refuses(tmp_path: Path, old: str, new: str, message: str) -> 
 
 def test_slum(tmp_path: Path) -> None:
     """Each column becomes a spectrum under its sample's code."""
-    path = tmp_path / "slum.csv"
-    path.write_text('"wavelength","A001","R002"\n8.0,0.94,0.41\n14.0,0.95,0.42\n')
-    spectra = libraries.slum(path)
+    table = b'"wavelength","A001","R002"\n8.0,0.94,0.41\n14.0,0.95,0.42\n'
+    spectra = libraries.slum(written(tmp_path / "slum.csv", table))
     assert list(spectra) == ["A001", "R002"]
     assert_allclose(spectra["R002"]["emissivity"], [0.41, 0.42], rtol=0, atol=0)
     assert_allclose(spectra["R002"]["wavelength"], [8e-6, 14e-6], rtol=0, atol=1e-12)
@@ -109,9 +107,8 @@ def test_slum(tmp_path: Path) -> None:
 
 def test_ucsb(tmp_path: Path) -> None:
     """The falling wavelengths are turned to rise; the name is the third column's."""
-    path = tmp_path / "brick.csv"
-    path.write_text("x1,x2,y_brick\n16,625,0.97\n3.125,3200,0.95\n")
-    spectrum = libraries.ucsb(path)
+    table = b"x1,x2,y_brick\n16,625,0.97\n3.125,3200,0.95\n"
+    spectrum = libraries.ucsb(written(tmp_path / "brick.csv", table))
     assert_allclose(spectrum["wavelength"], [3.125e-6, 16e-6], rtol=0, atol=1e-12)
     assert_allclose(spectrum["emissivity"], [0.95, 0.97], rtol=0, atol=0)
     assert spectrum.attrs["name"] == "brick"
@@ -120,8 +117,9 @@ def test_ucsb(tmp_path: Path) -> None:
 A001 = "wavelength,A001\n"
 
 
-@pytest.mark.parametrize(
-    ("name", "text", "message"),
+# A table with other columns, gaps, units, or wavenumbers that contradict the wavelengths.
+test_tables_are_refused = refused(
+    lambda folder, name, text: getattr(libraries, name)(written(folder / "a.csv", text.encode())),
     [
         ("slum", "", "Invalid columns"),
         ("slum", "nm,A001\n8,0.9\n", "Invalid columns"),
@@ -137,10 +135,6 @@ A001 = "wavelength,A001\n"
         ("ucsb", "x1,x2,z\n10,1000,0.95\n", "Must be x1, x2, y_<name>"),
         ("ucsb", "x1,x2,y_b\n10,1100,0.95\n", "wavenumber 1100.0 1/cm at 10.0 micrometres"),
     ],
+    "tmp_path",
+    ValueError,
 )
-def test_tables_are_refused(tmp_path: Path, name: str, text: str, message: str) -> None:
-    """A table with other columns, gaps, units, or wavenumbers that contradict the wavelengths."""
-    path = tmp_path / "a.csv"
-    path.write_text(text)
-    with pytest.raises(ValueError, match=message):
-        getattr(libraries, name)(path)

@@ -37,9 +37,8 @@ def test_hcc(tmp_path: Path) -> None:
     np.testing.assert_allclose(movie.time, np.arange(len(scene())) / 10.0, atol=1e-6)
     path.write_bytes(hcc(scene(), times=False, rate=20_000))
     np.testing.assert_allclose(readers.sequence(path).time[1], 0.05, atol=1e-9)
-    path.write_bytes(hcc(scene(), times=False, rate=0))
     with pytest.raises(ValueError, match=r"Missing clock= for 'a\.hcc'"):
-        readers.sequence(path)
+        readers.sequence(written(path, hcc(scene(), times=False, rate=0)))
 
 
 test_refused_by_rule = refused(
@@ -95,13 +94,11 @@ def test_signed_numbers_are_no_counts(tmp_path: Path) -> None:
     """Temperatures about 0 degC, as DJI's program writes them; saturated pixels are none."""
     path, (y, x) = tmp_path / "a.raw", np.mgrid[:48, :64]
     celsius = np.rint(150 + 165 * np.sin(y / 9) + 5 * np.cos(x / 11) + np.arange(3)[:, None, None])
-    path.write_bytes(celsius.astype("<i2").tobytes())
     with pytest.raises(ValueError, match=r"Invalid counts of 'a\.raw': as of signed numbers"):
-        bare(path, shape=(48, 64))
+        bare(written(path, celsius.astype("<i2").tobytes()), shape=(48, 64))
     counts = (20000 + celsius).astype("<u2")
     counts[:, 10:20, 10:20], counts[:, 10:12, 9] = 65535, 0
-    path.write_bytes(counts.tobytes())
-    assert bare(path, shape=(48, 64)).counts.max() == 65535
+    assert bare(written(path, counts.tobytes()), shape=(48, 64)).counts.max() == 65535
 
 
 def test_rows_of_half_or_twice_the_length(tmp_path: Path) -> None:
@@ -115,15 +112,13 @@ def test_rows_of_half_or_twice_the_length(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match=r"Invalid shape .*: rougher than \(48, 64\)"):
             bare(path, shape=shape)
     levels = 20000 + 50 * (y % 2) + 0.3 * y + rng.normal(0.0, 3.0, (9, 48, 64))
-    path.write_bytes(levels.astype("<u2").tobytes())
-    assert bare(path, shape=(48, 64)).sizes["x"] == 64
+    assert bare(written(path, levels.astype("<u2").tobytes()), shape=(48, 64)).sizes["x"] == 64
 
 
 def test_raw(tmp_path: Path) -> None:
     """Bare numbers with and without headers, in both orders; what does not fit is refused."""
     path, counts = tmp_path / "a.raw", scene()
-    path.write_bytes(counts.tobytes())
-    assert_array_equal(bare(path).counts, counts)
+    assert_array_equal(bare(written(path, counts.tobytes())).counts, counts)
     path.write_bytes(b"h" * 100 + b"".join(b"frame" + image.tobytes() for image in counts))
     assert_array_equal(bare(path, header=100, frame_header=5).counts, counts)
     with pytest.raises(ValueError, match=r"4723 bytes of 'a\.raw': 3 frames and 115 bytes"):
@@ -132,9 +127,8 @@ def test_raw(tmp_path: Path) -> None:
     assert_array_equal(bare(path, byte_order="big").counts, counts)
     with pytest.raises(ValueError, match=r"rougher than with bytes swapped"):
         bare(path)
-    path.write_bytes(counts.tobytes())
     with pytest.raises(ValueError, match=r"Invalid shape \(32, 24\) .*: rougher than \(24, 32\)"):
-        bare(path, shape=(32, 24))
+        bare(written(path, counts.tobytes()), shape=(32, 24))
     # So are rows and columns of pixels that differ more than the scene, if the scene changes.
     rng = np.random.default_rng(1)
     pattern, noise = rng.integers(0, 4000, (24, 32)), rng.normal(0.0, 3.0, (20, 24, 32))
@@ -153,9 +147,8 @@ def test_raw(tmp_path: Path) -> None:
         for shape in ((32, 24), (16, 48)):
             with pytest.raises(ValueError, match=r"Invalid shape .*: rougher than \(24, 32\)"):
                 bare(path, shape=shape)
-    path.write_bytes(counts.astype(">u2").tobytes())
     with pytest.raises(ValueError, match=r"Invalid shape \(1000000, .* of less than 2 GB"):
-        bare(path, shape=(1_000_000, 1_000_000))
+        bare(written(path, counts.astype(">u2").tobytes()), shape=(1_000_000, 1_000_000))
     with pytest.raises(ValueError, match=r"Invalid shape \(0, 32\)"):
         bare(path, shape=(0, 32))
     with pytest.raises(ValueError, match=r"Invalid frame_header of .a.raw. -1"):

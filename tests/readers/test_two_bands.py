@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from flir_files import Values, scene, sequence
+from hostile_files import written
 from numpy.testing import assert_allclose, assert_array_equal
 from refused import refused
 
@@ -23,8 +24,7 @@ def recorded(
 ) -> xr.Dataset:
     """Recording of counts by a made-up FLIR camera."""
     seconds = [start + k / rate for k in range(len(counts))]
-    path.write_bytes(sequence(counts, seconds=seconds, values=values))
-    return readers.flir(path)
+    return readers.flir(written(path, sequence(counts, seconds=seconds, values=values)))
 
 
 @pytest.fixture

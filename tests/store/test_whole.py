@@ -40,16 +40,15 @@ with store.whole(sys.argv[1], ".md") as draft:
 def writer(path: Path, way: str = "") -> Iterator[subprocess.Popen[str]]:
     """Process that has begun to write an output, and does not end."""
     command = [sys.executable, "-c", WRITER, str(path), way]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
-    assert process.stdout is not None
-    try:
-        assert process.stdout.readline() == "writing\n"
-        yield process
-    finally:
-        with suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-        process.stdout.close()
+    pipe: Any = {"stdout": subprocess.PIPE, "text": True, "start_new_session": True}
+    with subprocess.Popen(command, **pipe) as process:
+        assert process.stdout is not None
+        try:
+            assert process.stdout.readline() == "writing\n"
+            yield process
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
 
 
 def names(folder: Path) -> list[str]:
