@@ -11,6 +11,7 @@ import hypothesis
 import numpy as np
 import pytest
 import xarray as xr
+from captures import FILMS, GLASS
 from scenes import Shelf
 
 from dbthermal import simulation
@@ -52,6 +53,16 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(11)
 
 
+@pytest.fixture
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Project without notebooks, which is the current folder."""
+    for name in ("notebooks", "params", "tests"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "data_manifest.yaml").touch()
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
 @pytest.fixture(scope="session")
 def shelf(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Shelf:
     """Small scenes and what comes out of them, shared by all workers of the session."""
@@ -64,12 +75,10 @@ def shelf(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 def glass() -> tuple[xr.Dataset, xr.Dataset, xr.Dataset]:
     """Scene, capture and response: glass 0.86/0.72, 20 pixels as an image of 4 by 5."""
     rig, time, rng = Rig(), np.arange(350) / 10.0, np.random.default_rng(11)
-    emissivity = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(rig.bands)})
     make = independent_pixels
-    flat = make(time, emissivity, Background(), 20, rng, start=293.15, stop=333.15)
-    names = ("object_temperature", "background_temperature")
-    warm, cold = (flat[name].values.reshape(350, 4, 5) for name in names)
-    scene = simulation.scene(time, warm, cold, emissivity)
+    flat = make(time, GLASS, Background(), 20, rng, start=293.15, stop=333.15)
+    warm, cold = (flat[name].values.reshape(350, 4, 5) for name in FILMS)
+    scene = simulation.scene(time, warm, cold, GLASS)
     response = rig.response()
     return scene, simulation.observe(scene, response, rng), response
 

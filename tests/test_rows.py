@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
+from captures import people, transform_of
 
 from dbthermal import _arrays, alignment, correction, simulation
 from dbthermal.correction import _pixels
@@ -54,9 +55,7 @@ def recorded(
 ) -> tuple[xr.Dataset, xr.Dataset]:
     """Raw capture of people before glass, 24 by 28 pixels, and its correction."""
     rng, rig, shape = np.random.default_rng(seed), simulation.Rig(bad_fraction=bad), (24, 28)
-    glass = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(rig.bands)})
-    scene = simulation.walkers(np.arange(frames) / 10.0, shape, glass, rng)
-    seen = simulation.observe(scene, rig.response(), rng)
+    _, seen = people(rng, frames, shape, rig=rig)
     if shutter:
         seen = disturbances.fire_shutter(disturbances.spoil_pixels(seen, bad, rng), shutter, rng)
     detector = simulation.pattern(rig, shape, rng)
@@ -69,11 +68,7 @@ def test_a_capture_corrected_and_aligned_by_rows(monkeypatch: pytest.MonkeyPatch
     """Computed by rows, the counts, status and all else are those computed at once."""
     raw, fitted = recorded(150, 2, bad=0.01, shutter=[7.0])
     patch = xr.DataArray(np.indices((24, 28)).max(axis=0) < 5, dims=("y", "x"))
-    transform = xr.DataArray(
-        np.stack([np.eye(3), [[1.01, 0.0, 1.5], [0.01, 0.99, -2.25], [0.0, 0.0, 1.0]]]),
-        dims=("band", "row", "column"),
-        coords={"band": raw["band"].values},
-    )
+    transform = transform_of([[1.01, 0.0, 1.5], [0.01, 0.99, -2.25], [0.0, 0.0, 1.0]])
 
     def process(*, lazy: bool) -> tuple[xr.Dataset, xr.Dataset]:
         corrected = correction.correct_capture(

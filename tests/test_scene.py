@@ -9,17 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
+from captures import GLASS, RIG
 
 from dbthermal import alignment, separation, simulation, store
 from dbthermal.correction import correct_capture
 from dbthermal.scene import separate_capture
-from dbthermal.simulation import Rig
 from reproduction import disturbances
 from reproduction.experiments import whole
 from reproduction.experiments.pictures import Picture, smooth_shift
 
-RIG = Rig()
-GLASS = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(RIG.bands)})
 FRAME = 0.1  # [s]
 STEP = 0.004  # of the simulated scene's clock [s]
 INTERVAL = 1.96

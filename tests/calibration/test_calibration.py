@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
+from captures import GLASS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -19,7 +20,6 @@ Change = Callable[[xr.DataArray], xr.DataArray]
 LOWEST, HIGHEST = 283.15, 343.15  # 10 to 70 degrees Celsius [K]
 UNIT = 115.0 / float(bands.FILTERS["8-14"].slope(300.0))  # count per W m-2 sr-1
 OFFSET = 15500.0  # count
-GLASS = xr.DataArray([0.86, 0.72], dims="band", coords={"band": ["8-14", "9.5"]})
 STDS = (0.1, 0.05)  # of a thermocouple's and of a blackbody's reading [K]
 
 

@@ -11,21 +11,11 @@ from refused import refused
 from dbthermal import calibration, response
 from dbthermal.calibration import Bias
 from dbthermal.simulation import Rig
-from reproduction.experiments.bench import (
-    OBJECTS,
-    Bench,
-    Sample,
-    band_emissivity,
-    bench_series,
-    compare_procedures,
-    contact_measurements,
-    reflector_sensitivity,
-    reflector_series,
-)
+from reproduction.experiments import bench
 
 STDS = (0.2, 0.3)  # of a contact reading and of the foil [K]
 TRUE = np.array([0.3, 0.45])
-NO_ERRORS = Bench(
+NO_ERRORS = bench.Bench(
     contact=(0.0, 0.0),
     foil_emissivity=0.0,
     mirrored_excess=(0.0, 0.0),
@@ -88,14 +78,14 @@ def warmer(it: xr.Dataset, by: float) -> xr.Dataset:
     return it.assign(object_temperature=it["object_temperature"] + by)
 
 
-@pytest.mark.parametrize("sample", OBJECTS, ids=lambda sample: sample.name)
-def test_both_procedures_are_exact_without_errors(known: xr.Dataset, sample: Sample) -> None:
+@pytest.mark.parametrize("sample", bench.OBJECTS, ids=lambda sample: sample.name)
+def test_both_procedures_are_exact_without_errors(known: xr.Dataset, sample: bench.Sample) -> None:
     """With errors of zero, noise of a billionth and a perfect mirror both give the truth."""
     quiet, rng = known.assign(noise=1e-9 * known["noise"]), np.random.default_rng(0)
     mirror = replace(sample, stray=0.0)
-    true = band_emissivity(mirror, ("8-14", "9.5"))
-    series = bench_series(quiet, mirror, NO_ERRORS, rng)
-    foil = reflector_series(quiet, mirror, NO_ERRORS, rng)
+    true = bench.band_emissivity(mirror, ("8-14", "9.5"))
+    series = bench.bench_series(quiet, mirror, NO_ERRORS, rng)
+    foil = bench.reflector_series(quiet, mirror, NO_ERRORS, rng)
     by_contact = calibration.fit_emissivity(series, quiet, STDS)
     by_foil = calibration.reflector_emissivity(foil, quiet, STDS)
     for found in (by_contact, by_foil):
@@ -105,7 +95,7 @@ def test_both_procedures_are_exact_without_errors(known: xr.Dataset, sample: Sam
 @pytest.fixture(scope="module")
 def table(known: xr.Dataset) -> xr.Dataset:
     """Forty series of each object by every procedure."""
-    return compare_procedures(known, np.random.default_rng(1), repeats=40)
+    return bench.compare_procedures(known, np.random.default_rng(1), repeats=40)
 
 
 def test_bench_s_error_bars_are_true(table: xr.Dataset) -> None:
@@ -124,7 +114,7 @@ def test_reflector_method_fails_at_low_emissivity(table: xr.Dataset) -> None:
 
 def test_its_failure_is_the_mirrored_direction(known: xr.Dataset) -> None:
     """In a uniform room its error is below 0.015; it grows with the mirrored direction's excess."""
-    found = reflector_sensitivity(known, np.random.default_rng(1), (0.0, 11.0), repeats=60)
+    found = bench.reflector_sensitivity(known, np.random.default_rng(1), (0.0, 11.0), repeats=60)
     assert found["mean"].dims == ("object", "excess", "band")
     even = found["mean"].sel(excess=0.0)
     np.testing.assert_allclose(even, found["true"], rtol=0, atol=0.015)
@@ -134,11 +124,11 @@ def test_its_failure_is_the_mirrored_direction(known: xr.Dataset) -> None:
 
 def test_other_bands_follow_the_kin() -> None:
     """Metals by the ratio of emissivities, dielectrics by that of reflectances, all in (0, 1)."""
-    for sample in OBJECTS:
-        value = band_emissivity(sample, ("8-14", "9.5"))
+    for sample in bench.OBJECTS:
+        value = bench.band_emissivity(sample, ("8-14", "9.5"))
         assert float(value[0]) == pytest.approx(sample.emissivity, abs=1e-12)
         assert 0 < float(value[1]) < 1
-    glass = band_emissivity(OBJECTS[-1], ("9.5",))
+    glass = bench.band_emissivity(bench.OBJECTS[-1], ("9.5",))
     assert float(glass[0]) == pytest.approx(1 - 0.05 * (1 - 0.7180) / (1 - 0.8605), abs=1e-9)
 
 
@@ -148,7 +138,7 @@ def test_common_errors_do_not_average_out(known: xr.Dataset) -> None:
     def stated(number: int, bias: Bias) -> float:
         stds, warm = (0.1, 0.05), np.full(number, 330.0)
         rng, true = np.random.default_rng(0), emissivity_of(0.9, 0.8)
-        series = contact_measurements(known, true, warm, warm - 35.0, stds, rng)
+        series = bench.contact_measurements(known, true, warm, warm - 35.0, stds, rng)
         return float(calibration.fit_emissivity(series, known, stds, bias)["emissivity_std"][0])
 
     alone, common = Bias(), Bias(object_tolerance=2.0)
@@ -160,7 +150,9 @@ def test_scatter_does_not_pass_for_contrast(known: xr.Dataset) -> None:
     """Readings that scatter by 0.5 K at a contrast of 2 K give no bias; the scatter is stated."""
     rng, true = np.random.default_rng(3), emissivity_of(0.9, 0.8)
     warm, stds = np.full(200, 300.0), (0.5, 0.05)
-    series = (contact_measurements(known, true, warm, warm - 2.0, stds, rng) for _ in range(60))
+    series = (
+        bench.contact_measurements(known, true, warm, warm - 2.0, stds, rng) for _ in range(60)
+    )
     found = xr.concat([calibration.fit_emissivity(it, known, stds) for it in series], "repeat")
     spread, stated = found["emissivity"].std("repeat"), found["emissivity_std"].mean("repeat")
     np.testing.assert_allclose(found["emissivity"].mean("repeat"), true, rtol=0, atol=0.01)
@@ -190,12 +182,12 @@ def test_no_convergence_is_an_error(known: xr.Dataset, monkeypatch: pytest.Monke
     """A fit that is stopped before convergence raises an error with the band's name."""
     monkeypatch.setattr("dbthermal.calibration._ITERATIONS", 1)
     rng = np.random.default_rng(0)
-    series = bench_series(known, OBJECTS[0], Bench(), rng)
+    series = bench.bench_series(known, bench.OBJECTS[0], bench.Bench(), rng)
     with pytest.raises(ArithmeticError, match=r"No convergence in band '8-14': emissivity 0\."):
         calibration.fit_emissivity(series, known, STDS)
 
 
-COLD = Bench(object_temperatures=(300.0,))
+COLD = bench.Bench(object_temperatures=(300.0,))
 
 
 test_bad_bias_and_bench = refused(
@@ -206,11 +198,11 @@ test_bad_bias_and_bench = refused(
         (lambda _: Bias(stray=(0.0, 1.0)), "Invalid stray (0.0, 1.0). Must be a range"),
         (lambda _: Bias(air_temperature=-20.0), "Invalid air_temperature [K] -20.0"),
         (
-            lambda it: reflector_series(it, OBJECTS[0], COLD, np.random.default_rng(0)),
+            lambda it: bench.reflector_series(it, bench.OBJECTS[0], COLD, np.random.default_rng(0)),
             "One must be 10.0 K above the air's 295.15 K",
         ),
         (
-            lambda it: compare_procedures(it, np.random.default_rng(0), repeats=1),
+            lambda it: bench.compare_procedures(it, np.random.default_rng(0), repeats=1),
             "Invalid comparison of 5 samples, 1 times",
         ),
     ],

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
+from captures import plain_capture
 from scipy.ndimage import gaussian_filter
 
 from dbthermal import separation, simulation
@@ -180,8 +181,7 @@ def repeated(raw: xr.Dataset, times: tuple[int, int], later: int = 0) -> xr.Data
     counts, frames = raw["counts"].values, 240 * min(times)
     places = [np.arange(frames) // times[0], (np.arange(frames) + later) // times[1]]
     films = [band[np.minimum(place, 239)] for band, place in zip(counts, places, strict=True)]
-    coords = {"band": BANDS, "time": np.arange(frames) / 30.0}
-    return xr.Dataset({"counts": (raw["counts"].dims, np.stack(films))}, coords)
+    return plain_capture(np.stack(films), np.arange(frames) / 30.0)
 
 
 @pytest.mark.parametrize(("times", "later"), [((3, 3), 0), ((3, 3), 1), ((3, 1), 0), ((2, 4), 1)])

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
-from captures import drift
+from captures import GLASS, drift
 
 from dbthermal import schema, simulation
 from dbthermal.correction import blackbody_statistics, correct_capture, fit_correction
@@ -34,8 +34,7 @@ class Recorded:
 def recorded() -> Recorded:
     """Walkers at 60 Hz by cameras that lag, drift, close a shutter, and have bad pixels."""
     rng, rig = np.random.default_rng(4), simulation.Rig(noise=(1e-6, 1e-6), bad_fraction=0.0)
-    emissivity = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(rig.bands)})
-    scene = simulation.walkers(np.arange(FRAMES) / RATE, SHAPE, emissivity, rng)
+    scene = simulation.walkers(np.arange(FRAMES) / RATE, SHAPE, GLASS, rng)
     clean = simulation.observe(scene, rig.response(), rng)
     clean["counts"] = clean["counts"].where(~PATCH, 17000.0).transpose("band", "time", "y", "x")
     # In the order of the instrument: thermal lag, read-out noise, drift, bad pixels, shutter.

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
+from captures import plain_capture
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -53,11 +54,7 @@ def ideal(rng: np.random.Generator) -> xr.Dataset:
 def capture() -> xr.Dataset:
     """Two bands of three frames, every sample inside the detector's range."""
     counts = 20000 + np.arange(2 * 3 * 2 * 4, dtype=np.uint16).reshape(2, 3, 2, 4)
-    return xr.Dataset(
-        {"counts": (("band", "time", "y", "x"), counts, {"units": "count"})},
-        coords={"band": ["8-14", "9.5"], "time": [0.0, 0.1, 0.3]},
-        attrs={"camera": "simulated"},
-    )
+    return plain_capture(counts, [0.0, 0.1, 0.3]).assign_attrs(camera="simulated")
 
 
 @pytest.fixture
@@ -247,6 +244,8 @@ test_what_does_not_fit_is_refused = refused(
             lambda c, k: undo_lag(correct(c, k).assign(status=FLOATING), 0.01),
             "Invalid dtype float64 of 'status' of the corrected",
         ),
+        (lambda _, k: renew_offset(k, k["offset"] * np.nan), "flat image, in a good pixel: NaN"),
+        (lambda _, k: renew_offset(k, k.gain[..., :3]), "Invalid size 3 of 'x' of the flat image"),
         *(  # as by `correct`
             (
                 lambda _, k, gain=gain: renew_offset(gained(k, gain), 0 * k["offset"] + 20000.0),
@@ -335,7 +334,3 @@ def test_renewed_offset_evens_the_picture() -> None:
     assert float(even.std(("y", "x")).max()) < 1e-6
     np.testing.assert_allclose(even.mean(("y", "x")), seen.mean(("y", "x")), rtol=0, atol=1e-6)
     assert renewed.attrs["offset_renewed"] == 1
-    with pytest.raises(ValueError, match="flat image, in a good pixel: NaN"):
-        renew_offset(correction, flat * np.nan)
-    with pytest.raises(ValueError, match="Invalid size 3 of 'x' of the flat image"):
-        renew_offset(correction, flat.isel(x=slice(3)))

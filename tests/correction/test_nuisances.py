@@ -7,9 +7,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import xarray as xr
-from captures import RIG, drift, movie, still, walkers
+from captures import RIG, drift, movie, plain_capture, still, walkers
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from marks import slow
 from refused import refused
 
 from dbthermal import schema, separation
@@ -81,10 +82,7 @@ def test_a_copy_is_a_copy_in_every_pixel() -> None:
     counts = rng.normal(16000.0, 4.0, (1, 20, 200, 220)).astype(np.float32)
     counts[0, [7, 12]] = counts[0, [6, 11]]
     counts[0, 12, 101, 33] += 1.0
-    capture = xr.Dataset(
-        {"counts": (("band", "time", "y", "x"), counts)},
-        coords={"band": ["9.5"], "time": np.arange(20.0)},
-    )
+    capture = plain_capture(counts, np.arange(20.0), ["9.5"])
     assert rows(find_shutter(capture)) == [("9.5", 7, 1, False)]
 
 
@@ -291,12 +289,7 @@ def holes(kind: str, seed: int = 3) -> npt.NDArray[np.bool_]:
 
 
 @pytest.mark.parametrize(
-    "kind",
-    ["10%"]
-    + [
-        pytest.param(kind, marks=pytest.mark.slow)
-        for kind in ("1%", "40%", "rows", "frames of a band", "every other frame")
-    ],
+    "kind", ["10%", *slow("1%", "40%", "rows", "frames of a band", "every other frame")]
 )
 def test_holes_do_not_hide_bad_pixels(kind: str) -> None:
     """Bad pixels are found, and few others, where up to 40 %, rows or every other frame lack."""
@@ -359,10 +352,7 @@ def recorded(seed: int, noise: float = 3.4) -> tuple[Floats, xr.Dataset]:
 
 def marked(raw: Floats, correction: xr.Dataset, bit: Status) -> npt.NDArray[np.bool_]:
     """Pixels (y, x) that the correction marks with a bit."""
-    capture = xr.Dataset(
-        {"counts": (("band", "time", "y", "x"), raw.astype(np.uint16))},
-        {"band": BANDS, "time": np.arange(FRAMES) / 10.0},
-    )
+    capture = plain_capture(raw.astype(np.uint16))
     status = correct_capture(capture, correction, bad_pixels=None)["status"].values
     return np.asarray(status & np.uint32(bit) != 0)
 

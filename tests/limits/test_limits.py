@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
-from captures import emissivity_of, polynomials
+from captures import FILMS, RIG, emissivity_of, polynomials
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from refused import refused
@@ -18,7 +18,6 @@ from dbthermal.limits import SKY, _fisher
 from dbthermal.simulation import Background, Rig
 from reproduction.experiments.cases import independent_pixels, ratio_variance_bound
 
-RIG = Rig()
 THREE = Rig(bands=("8-14", "9.5", "10.6"), noise=(0.03, 0.35, 0.15))
 TIME = np.arange(350) / 10.0
 NOTHING: dict[str, Any] = {"resting": False, "response_kind": "linear"}
@@ -56,8 +55,7 @@ def test_known_emissivities_give_the_closed_form() -> None:
     scene = scene_of(0.86, 0.72).isel(time=slice(0, 12))
     found = limits.bounds(scene, RIG.response(), order=12, resting=False, emissivity_std=0.0)
     curves = [responses.curve(RIG.response(), name) for name in RIG.bands]
-    names = ("object_temperature", "background_temperature")
-    temperatures = np.stack([scene[name] for name in names])
+    temperatures = np.stack([scene[name] for name in FILMS])
     shares = np.array([[0.86, 0.14], [0.72, 0.28]])[..., None, None, None]
     pairs = zip(shares, curves, strict=True)
     mixed = np.stack([share * curve.slope(temperatures) for share, curve in pairs])
@@ -66,7 +64,7 @@ def test_known_emissivities_give_the_closed_form() -> None:
     # var = J^-1 diag(s^2) J^-T of each sample.
     inverse = np.linalg.inv(np.moveaxis(mixed, (0, 1), (-2, -1)))
     variance = np.moveaxis(inverse**2 @ np.square([std[0], std[1]]), -1, 0)
-    for name, expected in zip(names, np.sqrt(variance), strict=True):
+    for name, expected in zip(FILMS, np.sqrt(variance), strict=True):
         np.testing.assert_allclose(found[f"{name}_std"], expected, rtol=1e-9)
     assert not found["emissivity_std"].any()
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
-from captures import movie, still
+from captures import FILMS, GLASS, movie, still
 from hypothesis import given
 from hypothesis import strategies as st
 from refused import refused
@@ -17,7 +17,6 @@ from dbthermal.simulation import Background, Rig, capture, heating, observe
 from reproduction import disturbances
 
 TIME = np.arange(120) / 10.0  # s
-GLASS = xr.DataArray([0.86, 0.72], dims="band", coords={"band": ["8-14", "9.5"]})
 SHAPE = (12, 16)
 
 
@@ -116,8 +115,7 @@ QUIET = KNOWN.assign(noise=1e-9 * KNOWN["noise"])
 def test_observed_counts(made: Made) -> None:
     """Without noise the counts are e U(x) + (1 - e) U(y), whatever the order of the bands."""
     seen = observe(made.twin.isel(band=[1, 0]), QUIET, made.rng, dtype="float64")
-    names = ("object_temperature", "background_temperature")
-    emitted, reflected = (response.counts(KNOWN, made.twin[name]) for name in names)
+    emitted, reflected = (response.counts(KNOWN, made.twin[name]) for name in FILMS)
     expected = GLASS * emitted + (1 - GLASS) * reflected
     np.testing.assert_allclose(seen["counts"], expected, rtol=0, atol=1e-6)  # count
     assert schema.check(seen, "corrected").attrs["origin"] == "simulated"

@@ -11,6 +11,7 @@ import av
 import numpy as np
 import pytest
 import xarray as xr
+from captures import plain_capture
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
@@ -220,8 +221,7 @@ def test_text_keeps_its_record(tmp_path: Path) -> None:
 def rows(count: int) -> list[xr.Dataset]:
     """Rows of a small capture with attributes, one in each part."""
     values = np.arange(2 * 3 * count * 4, dtype=np.float32).reshape(2, 3, count, 4)
-    counts = (("band", "time", "y", "x"), values, {"units": "count"})
-    whole = xr.Dataset({"counts": counts}, {"band": ["8-14", "9.5"], "time": np.arange(3.0)})
+    whole = plain_capture(values, np.arange(3.0))
     whole.attrs = {"origin": "simulated", "warnings": ["one"]}
     return [whole.isel(y=slice(top, top + 1)) for top in range(count)]
 
