@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from captures import emissivity_of
 
 from dbthermal import response as responses
 from dbthermal import simulation, store
@@ -51,10 +52,10 @@ def test_recordings_have_each_its_own_noise() -> None:
 def scene() -> xr.Dataset:
     """An object that warms evenly before a background that steps."""
     time = np.arange(11) / 10
-    emissivity = xr.DataArray([0.8, 0.6], dims="band", coords={"band": list(RIG.bands)})
     warm = np.broadcast_to(300 + 10 * time[:, np.newaxis, np.newaxis], (11, *SHAPE))
     background = np.where(np.arange(11)[:, np.newaxis, np.newaxis] < 5, 295.0, 300.0)
-    return simulation.scene(time, warm, np.broadcast_to(background, (11, *SHAPE)), emissivity)
+    cold = np.broadcast_to(background, (11, *SHAPE))
+    return simulation.scene(time, warm, cold, emissivity_of(0.8, 0.6))
 
 
 def test_truth_at_the_times_of_a_capture() -> None:

@@ -17,17 +17,13 @@ CELL += 'plate = {"shape": [2, 3], "kind": "flat"}\nrate = 10.0\nknown = True\n'
 
 
 @pytest.fixture
-def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def project(project: Path) -> Path:
     """Project with a notebook of two cells."""
-    for folder in ("notebooks", "params"):
-        (tmp_path / folder).mkdir()
-    (tmp_path / "data_manifest.yaml").touch()
-    (tmp_path / "params/03_tiny.yaml").write_text("results: full\nframes: 9\n")
+    (project / "params/03_tiny.yaml").write_text("results: full\nframes: 9\n")
     cells = [nbformat.v4.new_code_cell(text) for text in (CELL, "print(frames)")]
     cells[0].metadata["tags"] = ["parameters"]
-    nbformat.write(nbformat.v4.new_notebook(cells=cells), tmp_path / "notebooks/03_tiny.ipynb")
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+    nbformat.write(nbformat.v4.new_notebook(cells=cells), project / "notebooks/03_tiny.ipynb")
+    return project
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ import inspect
 import numpy as np
 import pytest
 import xarray as xr
+from captures import FILMS
 from matplotlib.figure import Figure
 from sketches import array
 
@@ -35,9 +36,8 @@ def draw_pooled(fill: float = 1.0) -> Figure:
 
 def separated(fill: float = 1.0) -> xr.Dataset:
     """Temperatures of a scene with their deviations."""
-    names = ("object_temperature", "background_temperature")
     movie = fill * array("time y x", 2, 5, 6)
-    parts = dict.fromkeys(names, movie) | {f"{name}_std": movie - 300 for name in names}
+    parts = dict.fromkeys(FILMS, movie) | {f"{name}_std": movie - 300 for name in FILMS}
     return xr.Dataset(parts)
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import nbformat
 import pytest
+from marks import long, slow
 
 from reproduction import locked
 
@@ -167,9 +168,7 @@ FOUR = [("TERM", MOMENTS[1]), ("ctrl-c", MOMENTS[0]), ("KILL", MOMENTS[0]), ("ke
 
 
 @pytest.mark.parametrize(
-    ("victim", "moment"),
-    [pytest.param(*one, marks=pytest.mark.slow) for one in FOUR]
-    + [pytest.param(*one, marks=pytest.mark.long) for one in VICTIMS if one not in FOUR],
+    ("victim", "moment"), slow(*FOUR) + long(*(one for one in VICTIMS if one not in FOUR))
 )
 def test_whatever_is_killed(checkout: Path, started: Start, victim: str, moment: str) -> None:
     """Without make, the runner or the kernel nothing goes on, and the next make does all anew."""

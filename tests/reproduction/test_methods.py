@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
-from captures import emissivity_of
+from captures import FILMS, GLASS, RIG, plain_capture
+from marks import slow
 from numpy.typing import NDArray
 from refused import refused
 
@@ -22,21 +23,16 @@ from reproduction.methods.naive import NaiveSettings
 from reproduction.methods.ratio import RatioSettings
 
 Floats = NDArray[np.float64]
-RIG = Rig()
 RESPONSE = RIG.response()
 CURVES = [responses.curve(RESPONSE, name) for name in RIG.bands]
 TIME = np.arange(120) / 4.0
-GLASS = emissivity_of(0.86, 0.72)
 WARM = np.linspace(290.0, 340.0, 24)[:, np.newaxis, np.newaxis]
 KINDS = ["wide", "narrow"]
 
 
 def capture_of(counts: list[Floats], names: tuple[str, ...] = RIG.bands) -> xr.Dataset:
     """Capture of counts (time, y, x) a band, without noise."""
-    return xr.Dataset(
-        {"counts": (("band", "time", "y", "x"), np.stack(counts), {"units": "count"})},
-        {"band": list(names), "time": np.arange(len(counts[0])) / 4.0},
-    )
+    return plain_capture(np.stack(counts), np.arange(len(counts[0])) / 4.0, names)
 
 
 def seen(warm: Floats, cold: Floats, emissivity: tuple[float, float]) -> xr.Dataset:
@@ -63,8 +59,7 @@ def heated() -> xr.Dataset:
 @pytest.fixture(scope="module")
 def glass(heated: xr.Dataset) -> xr.Dataset:
     """Capture of the thirty pixels of glass, without noise."""
-    names = ("object_temperature", "background_temperature")
-    warm, cold = (heated[name].values for name in names)
+    warm, cold = (heated[name].values for name in FILMS)
     return seen(warm, cold, (0.86, 0.72))
 
 
@@ -249,9 +244,7 @@ def errors(scene: xr.Dataset, result: xr.Dataset) -> tuple[float, float]:
     return float(of_emissivity.median()), float(((of_object**2).mean("time") ** 0.5).median())
 
 
-@pytest.mark.parametrize(
-    ("noise", "pixels"), [(QUIET, 20), pytest.param((0.03, 0.05), 50, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("noise", "pixels"), [(QUIET, 20), *slow(((0.03, 0.05), 50))])
 def test_random_starts_find_the_emissivities(noise: tuple[float, float], pixels: int) -> None:
     """From random emissivities the median error at low noise is below 0.02, the object's 0.3 K."""
     scene, capture, response = noisy(noise, pixels)

@@ -77,16 +77,13 @@ def test_numbers_stay_outside_of_stores(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def project(project: Path) -> Path:
     """Project folder with a run of two notebooks, made the reference."""
-    (tmp_path / "data_manifest.yaml").touch()
-    (tmp_path / "tests").mkdir()
-    monkeypatch.chdir(tmp_path)
-    results = tmp_path / "results" / "full"
+    results = project / "results" / "full"
     numbers.save({"netd_K": 0.03, "missed": 0}, results / "01_calibration.json", RECORD)
     numbers.save({"libraries": "embedded"}, results / "02_emissivity.json", RECORD)
     assert verify.main(["--record"]) == 0
-    return tmp_path
+    return project
 
 
 def test_same_run_agrees(project: Path, capsys: pytest.CaptureFixture[str]) -> None:

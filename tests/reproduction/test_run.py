@@ -15,12 +15,9 @@ from reproduction.run import Run
 
 
 @pytest.fixture
-def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
+def run(project: Path) -> Run:
     """Run of a notebook with two parameters, in a project of its own."""
-    (tmp_path / "data_manifest.yaml").touch()
-    (tmp_path / "params").mkdir()
-    (tmp_path / "params" / "03_simulation.yaml").write_text("results: full\nseed: 1\n")
-    monkeypatch.chdir(tmp_path)
+    (project / "params" / "03_simulation.yaml").write_text("results: full\nseed: 1\n")
     return Run("03_simulation", {"results": "smoke", "seed": 2, "other": object()})
 
 

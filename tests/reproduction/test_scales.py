@@ -1,5 +1,7 @@
 """Pictures scaled anew in each frame, and their reflections: simulated, with known uncalibrated."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import xarray as xr
@@ -95,21 +97,6 @@ def test_constant_scale_is_left() -> None:
     assert float(abs(undone["gain"] - 1).max()) == 0.0
 
 
-def test_refusals() -> None:
-    """Too few still pixels, those of another picture, a gain that is not positive: errors."""
-    rng = np.random.default_rng(9)
-    shown = picture(scene(rng)[0], rng)
-    few, other = np.zeros((HEIGHT, WIDTH), bool), np.ones((HEIGHT, 5), bool)
-    with pytest.raises(ValueError, match=r"Invalid still pixels: 0 of them. Must be at least 200"):
-        uncalibrated.unscaled(shown, xr.DataArray(few, dims=("y", "x")))
-    with pytest.raises(ValueError, match="the still pixels"):
-        uncalibrated.unscaled(shown, xr.DataArray(other, dims=("y", "x")))
-    for gain in (0.0, -1.0, np.nan):
-        scaled = shown.assign_coords(gain=(("band", "time"), np.full((2, FRAMES), gain)))
-        with pytest.raises(ValueError, match=r"Invalid gain .* of a frame. Must be finite and > 0"):
-            uncalibrated.uncalibrated_reflection(scaled)
-
-
 def pulses() -> Floats:
     """Reflection in the left half, in the first band's unit (time, y, x)."""
     rng = np.random.default_rng(4)
@@ -172,6 +159,15 @@ def test_reflection_is_the_true_one(signal: xr.DataArray, parts: xr.Dataset) -> 
     assert float(np.std(true)) > 3 * noise
 
 
+def scaled(movie: xr.DataArray, gain: float) -> xr.DataArray:
+    """Movie whose frames have a gain."""
+    return movie.assign_coords(gain=(("band", "time"), np.full((2, FRAMES), gain)))
+
+
+GAIN = "Invalid gain .* of a frame. Must be finite and > 0"
+FEW = "Invalid still pixels: 0 of them. Must be at least 200"
+
+
 test_refused_signal = refused(
     lambda signal, change: uncalibrated.uncalibrated_reflection(change(signal)),
     [
@@ -182,6 +178,9 @@ test_refused_signal = refused(
         (lambda it: it[:, :8], "Invalid order 9 of the smooth subspace"),
         (lambda it: it[..., :30], "correlation below 0.1 in magnitude. Must be at least 100"),
         (lambda it: it[..., 30:], "0 pixels have a correlation above 0.5"),
+        *((partial(scaled, gain=it), GAIN) for it in (0.0, -1.0, np.nan)),
+        (lambda it: uncalibrated.unscaled(it, WALL & False), FEW),
+        (lambda it: uncalibrated.unscaled(it, WALL[:, :5] | True), "the still pixels"),
     ],
     "signal",
 )

@@ -14,21 +14,17 @@ from reproduction.run import Run
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(project: Path) -> Path:
     """Results of a finished notebook: a dataset, numbers, a picture and a recording."""
-    for name in ("params", "notebooks"):
-        (tmp_path / name).mkdir()
-    (tmp_path / "data_manifest.yaml").touch()
-    (tmp_path / "params/02_reader.yaml").write_text("results: full\n")
+    (project / "params/02_reader.yaml").write_text("results: full\n")
     for stem in ("01_calibration", "02_reader"):
-        (tmp_path / f"notebooks/{stem}.ipynb").touch()
-    folder = tmp_path / "results/full"
+        (project / f"notebooks/{stem}.ipynb").touch()
+    folder = project / "results/full"
     frames = xr.Dataset({"counts": ("time", np.arange(50))})
     for name in ("01_calibration_response.zarr", "01_calibration/scene.zarr"):
         store.save(frames, folder / name, {})
     numbers.save({"netd_K": 0.03}, folder / "01_calibration.json", {})
     (folder / "01_calibration_scene.png").write_bytes(b"picture")
-    monkeypatch.chdir(tmp_path)
     integrity.keep_sums("full", "01_calibration")
     (folder / "01_calibration.ipynb").touch()
     return folder

@@ -6,6 +6,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import xarray as xr
+from captures import GLASS
 from matplotlib.colors import to_rgb
 from matplotlib.container import BarContainer
 from matplotlib.figure import Figure
@@ -22,9 +23,8 @@ OBJECT = "object_temperature"
 
 def scene(frames: int = 20, pixels: int = 2000) -> xr.Dataset:
     """A scene of glass."""
-    pair = xr.DataArray([0.86, 0.72], dims="band", coords={"band": ["8-14", "9.5"]})
     time, rng = np.arange(frames) / 10.0, np.random.default_rng(0)
-    return independent_pixels(time, pair, Background(), pixels, rng, start=300.0, stop=320.0)
+    return independent_pixels(time, GLASS, Background(), pixels, rng, start=300.0, stop=320.0)
 
 
 def normal(truth: xr.Dataset, scale: float = 1.0, seed: int = 1) -> xr.Dataset:
