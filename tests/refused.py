@@ -3,10 +3,12 @@
 import re
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any
+from typing import Any, ParamSpec
 
 import pytest
 
+Arguments = ParamSpec("Arguments")
+Errors = type[Exception] | tuple[type[Exception], ...]
 REFUSALS = (KeyError, TypeError, ValueError)
 
 
@@ -15,11 +17,35 @@ def raising(message: str | None) -> AbstractContextManager[object]:
     return pytest.raises(ValueError, match=message) if message else nullcontext()
 
 
+def assert_raises(
+    error: Errors,
+    message: str,
+    call: Callable[Arguments, object],
+    /,
+    *arguments: Arguments.args,
+    **options: Arguments.kwargs,
+) -> None:
+    """A call raises an error, of which a pattern is found in the message."""
+    with pytest.raises(error, match=message):
+        call(*arguments, **options)
+
+
+def assert_refused(
+    message: str,
+    call: Callable[Arguments, object],
+    /,
+    *arguments: Arguments.args,
+    **options: Arguments.kwargs,
+) -> None:
+    """A call raises a ValueError, of which a pattern is found in the message."""
+    assert_raises(ValueError, message, call, *arguments, **options)
+
+
 def refused(
     call: Callable[..., Any],
     rows: Iterable[Sequence[Any]],
     fixtures: str = "",
-    error: type[Exception] | tuple[type[Exception], ...] = REFUSALS,
+    error: Errors = REFUSALS,
 ) -> Any:
     """Test of a function that raises an error for the arguments of each row.
 

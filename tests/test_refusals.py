@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from captures import GLASS, emissivity_of, transform_of
-from refused import raising
+from refused import assert_raises, assert_refused, raising
 from scenes import field
 
 from dbthermal import (
@@ -422,14 +422,11 @@ def test_coordinates_must_agree(name: str) -> None:
     for dim in dims.split():
         other = moved(array, dim)
         message = f"Invalid '{dim}' of .*: {other[dim].values[0]} at"
-        with pytest.raises(ValueError, match="Missing band '" if dim == "band" else message):
-            call(other)
+        assert_refused("Missing band '" if dim == "band" else message, call, other)
         if dim in {"time", "y", "x"}:
-            with pytest.raises(ValueError, match=f"'{dim}'"):
-                call(array.isel({dim: slice(None, None, -1)}))
+            assert_refused(f"'{dim}'", call, array.isel({dim: slice(None, None, -1)}))
         if dim in {"time", "y", "x"} and "separated_f" not in name and "frames" not in name:
-            with pytest.raises(ValueError, match=f"Invalid size .* of '{dim}'"):
-                call(array.isel({dim: slice(1, None)}))
+            assert_refused(f"Invalid size .* of '{dim}'", call, array.isel({dim: slice(1, None)}))
 
 
 @pytest.mark.parametrize(
@@ -514,14 +511,11 @@ def test_a_foreign_folder_stays(tmp_path: Path) -> None:
         lambda: separation.run(mine, tmp_path / "all.zarr", CAMERA),
     )
     for call in calls:
-        with pytest.raises(ValueError, match="Foreign folder"):
-            call()
+        assert_refused("Foreign folder", call)
     assert (foreign / "notes.txt").read_text() == (parts / "precious.txt").read_text() == "precious"
     (note := tmp_path / "note.zarr").write_text("precious")
-    with pytest.raises(ValueError, match="Foreign file"):
-        store.save(SCENE, note, {})
-    with pytest.raises(FileNotFoundError, match="an address"):
-        store.save(SCENE, "s3://bucket/a.zarr", {})
+    assert_refused("Foreign file", store.save, SCENE, note, {})
+    assert_raises(FileNotFoundError, "an address", store.save, SCENE, "s3://bucket/a.zarr", {})
     with pytest.raises(ValueError, match="Must be at most 60 letters"):
         store.save(SCENE.rename(emissivity="a/b"), tmp_path / "a.zarr", {})
 

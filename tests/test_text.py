@@ -9,6 +9,7 @@ from tempfile import TemporaryDirectory
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from refused import assert_raises, assert_refused
 
 from dbthermal.readers import read_yaml
 from reproduction import libraries
@@ -30,18 +31,15 @@ def test_text_is_refused_with_its_place(tmp_path: Path, content: bytes, message:
     """Bytes that are no text are named with line and column, a large file with its size."""
     path = tmp_path / "a.yaml"
     path.write_bytes(content)
-    with pytest.raises(ValueError, match=message):
-        read_yaml(path)
+    assert_refused(message, read_yaml, path)
 
 
 def test_only_regular_files_are_opened(tmp_path: Path) -> None:
     """A folder, a pipe and a device are refused; nothing waits for a pipe's other end."""
     os.mkfifo(tmp_path / "pipe")
     for path, kind in ((tmp_path, "folder"), (tmp_path / "pipe", "pipe"), ("/dev/zero", "pipe")):
-        with pytest.raises(ValueError, match=f"a {kind}.* Must be a regular file"):
-            read_yaml(path)
-    with pytest.raises(FileNotFoundError, match=r"absent\.txt"):
-        read_yaml(tmp_path / "absent.txt")
+        assert_refused(f"a {kind}.* Must be a regular file", read_yaml, path)
+    assert_raises(FileNotFoundError, r"absent\.txt", read_yaml, tmp_path / "absent.txt")
 
 
 def emissivity(folder: Path, text: str) -> float:
@@ -57,8 +55,7 @@ def test_decimal_numbers(tmp_path: Path) -> None:
         assert emissivity(tmp_path, text) == float(text)
     for text in ("", "nan", "inf", "1e999", "1_000", "1 000", "0x10", "\u0661\u0662", "1d3"):
         message = f"f.csv, line 2, column 2: Invalid number {text!r}"
-        with pytest.raises(ValueError, match=re.escape(message)):
-            emissivity(tmp_path, text)
+        assert_refused(re.escape(message), emissivity, tmp_path, text)
 
 
 ODD = "No 012 0o17 12:30 1_000 1e3 .inf -.5 1.0e+999 2026-01-02 0x1F ="

@@ -13,7 +13,7 @@ import xarray as xr
 from faulty_camera import BANDS, two_cameras
 from hypothesis import given
 from hypothesis import strategies as st
-from refused import refused
+from refused import assert_raises, refused
 
 from dbthermal import store
 from dbthermal.instruments import camera, telemetry
@@ -168,8 +168,7 @@ def test_full_disk_leaves_what_was_written(tmp_path: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr(Path, "open", full)
     monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(OSError, match="No space left on device"):
-        file.frame(BANDS[0], shot(7))
+    assert_raises(OSError, "No space left on device", file.frame, BANDS[0], shot(7))
     monkeypatch.undo()
     assert file.broken
     opened = store.open_dataset(tmp_path / "a.zarr")

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from faulty_camera import frames, two_cameras
 from faulty_devices import FILTERS, QUICK, BosonBench, LoggerBench, connected
+from refused import assert_raises
 from test_v4l2 import BYTES, GOOD, STREAM, Driver, session
 
 from dbthermal.instruments import boson, filterwheel, inventory, v4l2
@@ -173,19 +174,16 @@ def test_close_is_final(opened: Opened) -> None:
     """At the end of `with` it is closed, and says so with a remedy; a second close does nothing."""
     with opened.device as device:
         ask(device)
-    with pytest.raises(CLOSED, match=r"[Mm]ust|is closed"):
-        ask(opened.device)
+    assert_raises(CLOSED, r"[Mm]ust|is closed", ask, opened.device)
     opened.device.close()
-    with pytest.raises(CLOSED, match=r"[Mm]ust|is closed"):
-        ask(opened.device)
+    assert_raises(CLOSED, r"[Mm]ust|is closed", ask, opened.device)
 
 
 @opens(*CAMERAS[1:], *WHEELS[1:], *LOGGERS)
 def test_a_device_has_one_client(opened: Opened) -> None:
     """A second client gets an error with a remedy, and the first is not disturbed."""
     assert opened.again is not None
-    with pytest.raises(OSError, match="other program"):
-        opened.again()
+    assert_raises(OSError, "other program", opened.again)
     ask(opened.device)
 
 

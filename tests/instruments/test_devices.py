@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from faulty_devices import BosonBench, LoggerBench
+from refused import assert_raises, assert_refused
 from rig_session import bench, from_yaml, pictures, replaced, rig
 
 from dbthermal.instruments import boson
@@ -45,13 +46,10 @@ def test_whole_rig_is_closed() -> None:
         assert devices.wheel is not None
         assert devices.thermocouples is not None
     for ask in (devices.wheel.status, *(port.fpa_temperature for port in devices.cameras.values())):
-        with pytest.raises(TransportError, match="must stay connected and open"):
-            ask()
+        assert_raises(TransportError, "must stay connected and open", ask)
     for source in devices.sources.values():
-        with pytest.raises(ConnectionError, match="it is closed"):
-            source.read()
-    with pytest.raises(RuntimeError, match="closed"):
-        devices.thermocouples.identity()
+        assert_raises(ConnectionError, "it is closed", source.read)
+    assert_raises(RuntimeError, "closed", devices.thermocouples.identity)
 
 
 def test_readings_are_named(devices: Devices) -> None:
@@ -107,8 +105,7 @@ def test_camera_is_called_by_the_filter_in_the_beam(devices: Devices) -> None:
     assert {"fpa 11", "ffc 11"} < swept.readings().keys()
     assert swept.identities()["11"]["serial_number"] == "93589"
     assert swept.select("9.5").session.bands == ("8-14", "9.5")
-    with pytest.raises(ValueError, match=r"Invalid band '8-14' of the wheel"):
-        devices.select("8-14")
+    assert_refused(r"Invalid band '8-14' of the wheel", devices.select, "8-14")
     with pytest.raises(ValueError, match="Invalid band '11' of a session without a wheel"):
         Devices(devices.session, {}).select("11")
 
@@ -150,8 +147,7 @@ def test_frames_and_commands_of_two_cameras_are_told(devices: Devices) -> None:
     """Exchanged cables are detected where the frames carry a serial number."""
     crossed = dict(zip(devices.cameras, list(devices.cameras.values())[::-1], strict=True))
     wrong = Devices(devices.session, devices.sources, crossed)
-    with pytest.raises(ValueError, match=r"Invalid cameras \('93588', '93589'\) of band '8-14'"):
-        wrong.identities()
+    assert_refused(r"Invalid cameras \('93588', '93589'\) of band '8-14'", wrong.identities)
 
 
 def test_hardware_has_no_emulated_world() -> None:

@@ -10,6 +10,7 @@ from dialogue import Dialogue, Pair
 from faulty_devices import WheelBench, WheelFaults, connected
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refused import assert_raises, assert_refused
 
 from dbthermal.instruments.filterwheel import (
     NoReplyError,
@@ -64,14 +65,11 @@ def test_filters_are_called_by_their_band(bench: WheelBench) -> None:
     """The band that is selected is the one that the world's camera then sees."""
     (wheel := bench.wheel).select("9.5")
     assert (wheel.band(), bench.world.filter_name) == ("9.5", "9.5")
-    with pytest.raises(ValueError, match=r"Invalid band 'MW' .* one of \['9.5', 'LW', 'open'\]"):
-        wheel.select("MW")
+    assert_refused(r"Invalid band 'MW' .* one of \['9.5', 'LW', 'open'\]", wheel.select, "MW")
     for wrong in (0, 7):
-        with pytest.raises(ValueError, match=f"Invalid filter position {wrong}. Must lie in"):
-            wheel.move_to(wrong)
+        assert_refused(f"Invalid filter position {wrong}. Must lie in", wheel.move_to, wrong)
     wheel.move_to(2)
-    with pytest.raises(WheelError, match="No filter in slot 2"):
-        wheel.band()
+    assert_raises(WheelError, "No filter in slot 2", wheel.band)
     wheel.move_to(5)
     later = connected(bench.device)  # a new program need not home the wheel again
     assert later.band() == "LW"
@@ -81,12 +79,10 @@ def test_a_wheel_that_turns_or_rests_between_two_slots(bench: WheelBench) -> Non
     """It has no position and no filter in the beam, and is moved again once it was stopped."""
     bench.device.turn_to(200_000)
     assert bench.world.wheel_position is None
-    with pytest.raises(WheelError, match="still moving"):
-        bench.wheel.position()
+    assert_raises(WheelError, "still moving", bench.wheel.position)
     bench.clock.sleep(0.5)
     (wheel := bench.wheel).stop()
-    with pytest.raises(WheelError, match=r"between two slots, at .* deg"):
-        wheel.position()
+    assert_raises(WheelError, r"between two slots, at .* deg", wheel.position)
     wheel.move_to(2)
     assert wheel.position() == 2
 
@@ -105,8 +101,7 @@ def test_a_wheel_that_is_not_homed() -> None:
     """It is neither moved nor said where it is; it is asked from several threads."""
     (wheel := WheelBench().wheel).connect()
     for attempt in (wheel.position, lambda: wheel.move_to(1), lambda: wheel.select("LW")):
-        with pytest.raises(NotHomedError, match="Must be homed"):
-            attempt()
+        assert_raises(NotHomedError, "Must be homed", attempt)
     with ThreadPoolExecutor(max_workers=4) as pool:
         futures = [pool.submit(wheel.status) for _ in range(200)]
         assert len({status.result().position for status in futures}) == 1
@@ -215,8 +210,7 @@ def test_controllers_that_are_refused(
     """A controller that would not turn the wheel as it should raises an error on connecting."""
     bench = WheelBench(**case) if {"model", "serial_number"} & {*case} else WheelBench()
     vars(bench.device.faults).update(case)
-    with pytest.raises(error, match=message):
-        bench.wheel.connect()
+    assert_raises(error, message, bench.wheel.connect)
 
 
 @pytest.mark.parametrize(
@@ -269,14 +263,12 @@ def test_moves_that_fail(
     """A move that fails is an error in bounded time; where steps may be lost, home comes first."""
     wheel, before = bench.wheel, bench.clock()
     bench.device.faults = WheelFaults(**faults)
-    with pytest.raises(error, match=message):
-        wheel.move_to(3)
+    assert_raises(error, message, wheel.move_to, 3)
     assert bench.clock() - before < 30.0
     assert bool(bench.device.sent("MOT_MOVE_STOP")) == stopped
     bench.device.faults = WheelFaults()
     if lost:
-        with pytest.raises(NotHomedError, match="lost steps"):
-            wheel.move_to(1)
+        assert_raises(NotHomedError, "lost steps", wheel.move_to, 1)
         wheel.home()
     wheel.move_to(3)
     assert bench.world.wheel_position == 3
@@ -299,12 +291,10 @@ def test_searches_for_home_that_fail(
     wheel.status()
     wheel.move_to(4)
     bench.device.faults = WheelFaults(**faults)
-    with pytest.raises(error, match=message):
-        wheel.home()
+    assert_raises(error, message, wheel.home)
     bench.device.faults = WheelFaults()
     wheel.stop()
-    with pytest.raises(NotHomedError, match="Must be homed"):
-        wheel.position()
+    assert_raises(NotHomedError, "Must be homed", wheel.position)
 
 
 def test_moving_bits_that_stick(bench: WheelBench) -> None:
@@ -312,8 +302,7 @@ def test_moving_bits_that_stick(bench: WheelBench) -> None:
     bench.device.faults = WheelFaults(stuck="MOVING_FORWARD", stuck_from=bench.clock() + 0.3)
     bench.wheel.move_to(3)
     assert bench.world.wheel_position == 3
-    with pytest.raises(WheelError, match="still moving"):
-        bench.wheel.move_to(4)
+    assert_raises(WheelError, "still moving", bench.wheel.move_to, 4)
 
 
 def test_errors_of_the_greeting_are_logged_and_forgotten(caplog: pytest.LogCaptureFixture) -> None:
@@ -324,8 +313,7 @@ def test_errors_of_the_greeting_are_logged_and_forgotten(caplog: pytest.LogCaptu
         bench.homed()
     assert "unknown message" in caplog.text
     bench.device.faults.notice = "motor cold"
-    with pytest.raises(WheelError, match="motor cold"):
-        bench.wheel.home()
+    assert_raises(WheelError, "motor cold", bench.wheel.home)
 
 
 def test_answers_that_come_too_late(bench: WheelBench, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -334,8 +322,7 @@ def test_answers_that_come_too_late(bench: WheelBench, monkeypatch: pytest.Monke
     bench.device.faults.late = patient.device.faults.late = 1.2
     wheel.move_to(3)
     assert bench.world.wheel_position == wheel.position() == 3
-    with pytest.raises(StalledWheelError, match="did not start"):
-        wheel.move_to(6)
+    assert_raises(StalledWheelError, "did not start", wheel.move_to, 6)
     monkeypatch.setattr("dbthermal.instruments._apt.REPLY_TIMEOUT", 1.5)
     patient.homed().move_to(6)
     assert patient.world.wheel_position == 6

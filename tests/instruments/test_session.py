@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import yaml
 from hostile_files import seed_of_week
+from refused import assert_raises, assert_refused
 from rig_session import TEXT, from_yaml, replaced
 
 from dbthermal.__main__ import main
@@ -110,8 +111,7 @@ def test_two_of_a_thing() -> None:
     assert from_yaml(bench).blackbody is not None
     shared = ("v4l2:///dev/video2", "v4l2:///dev/video0")
     assert from_yaml(replaced(shared)).simulated
-    with pytest.raises(ValueError, match="Repeated address 'v4l2:///dev/video0'"):
-        from_yaml(replaced(shared, REAL))
+    assert_refused("Repeated address 'v4l2:///dev/video0'", from_yaml, replaced(shared, REAL))
 
 
 def test_shared_rig_is_in_a_file_of_its_own(tmp_path: Path) -> None:
@@ -131,16 +131,13 @@ def test_shared_rig_is_in_a_file_of_its_own(tmp_path: Path) -> None:
         ([*shared, "duration: 3"], "Repeated key of session and rig 'duration'"),
     ):
         rig.write_text("\n".join(lines), encoding="utf-8")
-        with pytest.raises(ValueError, match=message):
-            Session.load(path)
+        assert_refused(message, Session.load, path)
     rig.unlink()
     message = r"Missing file of key 'rig' of session '.*a\.yaml'.*: '.*rig\.yaml'$"
-    with pytest.raises(FileNotFoundError, match=message):
-        Session.load(path)
+    assert_raises(FileNotFoundError, message, Session.load, path)
     for name in ("[1]", "null", '"a\\0b"', "5", "."):
         path.write_text(f"name: a\nrig: {name}\n", encoding="utf-8")
-        with pytest.raises(ValueError, match=r"Invalid (rig|file) .* Must be"):
-            Session.load(path)
+        assert_refused(r"Invalid (rig|file) .* Must be", Session.load, path)
 
 
 @pytest.mark.parametrize("name", ["response", "emissivity_bench", "scene"])

@@ -13,6 +13,7 @@ from faulty_devices import LoggerBench
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
+from refused import assert_raises
 
 from dbthermal.instruments import tc08
 from dbthermal.instruments.tc08 import TC08, TC08Error
@@ -49,20 +50,17 @@ def test_any_answer_of_the_library(raw: list[float], bits: int) -> None:
 
 def test_unit_is_opened_and_closed(rig: LoggerBench) -> None:
     """The constructor opens nothing, a second close does nothing; channels are set anew."""
-    with pytest.raises(RuntimeError, match=r"closed\. Must be opened first"):
-        rig.driver.identity()
+    assert_raises(RuntimeError, r"closed\. Must be opened first", rig.driver.identity)
     rig.ready().close()
     rig.driver.close()
     info = rig.driver.open().identity()
     assert (info["serial_number"], info["driver"]) == ("EMULATED", "emulated")
     assert (info["is_simulated"], info["calibration_date"]) == (True, "01Jan00")
-    with pytest.raises(RuntimeError, match="open already"):
-        rig.driver.open()
+    assert_raises(RuntimeError, "open already", rig.driver.open)
     for channels in ({0: "a"}, {9: "a"}, {}):
         with pytest.raises(ValueError, match=r"channel \d\. Must lie in|Must be one at"):
             rig.driver.set_channels(channels)
-    with pytest.raises(RuntimeError, match="Must be set by set_channels first"):
-        rig.driver.single()
+    assert_raises(RuntimeError, "Must be set by set_channels first", rig.driver.single)
 
 
 def test_channels_that_are_set_later_are_read(rig: LoggerBench) -> None:
@@ -78,14 +76,12 @@ def test_firmware_download_is_waited_for(rig: LoggerBench) -> None:
     start, opened = rig.clock(), rig.unit.usb_tc08_open_unit_progress
     with patch.object(rig.unit, "usb_tc08_open_unit_progress") as progress:
         progress.side_effect = lambda *args: opened(*args) if rig.clock() >= start + 6.0 else 0
-        with pytest.raises(TimeoutError, match=r"not open after 5.0 s, at 0 %"):
-            rig.driver.open(timeout=5.0)
+        assert_raises(TimeoutError, r"not open after 5.0 s, at 0 %", rig.driver.open, timeout=5.0)
         rig.driver.open()
     assert rig.clock() - start == pytest.approx(6.0, abs=0.051)
     rig.driver.close()
     rig.unit.is_open = True  # by another program
-    with pytest.raises(ConnectionError, match=r"No TC-08\. Must be plugged in, and free"):
-        rig.driver.open()
+    assert_raises(ConnectionError, r"No TC-08\. Must be plugged in, and free", rig.driver.open)
 
 
 # What the vendor's header says of each error number, in a word.
@@ -110,8 +106,7 @@ def test_each_error_is_explained(rig: LoggerBench) -> None:
 def test_each_failing_step_of_opening_is_seen(rig: LoggerBench, function: str) -> None:
     """A step that fails is an error, and leaves no channel half set."""
     rig.fail(9, function)
-    with pytest.raises(TC08Error, match="EEPROM"):
-        rig.ready()
+    assert_raises(TC08Error, "EEPROM", rig.ready)
     with pytest.raises(RuntimeError):
         rig.driver.single()
 
@@ -133,11 +128,9 @@ def test_missing_library(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Non
     """Without the vendor's library the error says where to get it."""
     monkeypatch.setattr(ctypes.util, "find_library", lambda _: None)
     monkeypatch.delenv(tc08.ENVIRONMENT, raising=False)
-    with pytest.raises(FileNotFoundError, match=r"No library 'usbtc08'.*DBTHERMAL_USBTC08"):
-        tc08.load()
+    assert_raises(FileNotFoundError, r"No library 'usbtc08'.*DBTHERMAL_USBTC08", tc08.load)
     monkeypatch.setenv(tc08.ENVIRONMENT, str(tmp_path / "gone.so"))
-    with pytest.raises(OSError, match=r"gone\.so"):
-        tc08.load()
+    assert_raises(OSError, r"gone\.so", tc08.load)
 
 
 STUB = r"""
@@ -195,6 +188,5 @@ def test_types_of_a_real_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 def test_other_library_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A library without the functions is named, before anything is called."""
     monkeypatch.setenv(tc08.ENVIRONMENT, compiled(tmp_path, "int nothing;"))
-    with pytest.raises(OSError, match=r"stub.so' without usb_tc08_\w+. Must be libusbtc08"):
-        tc08.load()
+    assert_raises(OSError, r"stub.so' without usb_tc08_\w+. Must be libusbtc08", tc08.load)
     assert tc08.SIGNATURES["usb_tc08_set_channel"] == [c_int16, c_int16, c_int8]

@@ -14,7 +14,7 @@ from unittest.mock import Mock, PropertyMock
 
 import pytest
 import serial
-from refused import refused
+from refused import assert_raises, assert_refused, refused
 
 from dbthermal import instruments
 from dbthermal.instruments.camera import KINDS
@@ -62,8 +62,7 @@ def test_an_unplugged_device_is_an_error_with_its_name(terminal: Terminal) -> No
     os.close(terminal.far)
     with pytest.raises(TransportError, match="Could not read from 'serial:///dev/ttyACM0'"):
         terminal.line.read(1, 60.0)
-    with pytest.raises(TransportError, match="must stay connected"):
-        terminal.line.write(b"x")
+    assert_raises(TransportError, "must stay connected", terminal.line.write, b"x")
     for _ in range(2):
         terminal.line.close()
     with pytest.raises(TransportError):
@@ -73,8 +72,7 @@ def test_an_unplugged_device_is_an_error_with_its_name(terminal: Terminal) -> No
 def test_a_line_is_one_programs(terminal: Terminal, monkeypatch: pytest.MonkeyPatch) -> None:
     """A port that is open cannot be opened again."""
     assert not terminal.line.is_simulated
-    with pytest.raises(ValueError, match="a pseudo-terminal"):
-        open_serial(f"serial://{terminal.path}", baudrate=115200)
+    assert_refused("a pseudo-terminal", open_serial, f"serial://{terminal.path}", baudrate=115200)
     monkeypatch.setattr("pathlib.Path.is_relative_to", lambda *_: False)
     with pytest.raises(TransportError, match="in no other program's use"):
         open_serial(f"serial://{terminal.path}", baudrate=115200)

@@ -14,6 +14,7 @@ from faulty_camera import frames
 from faulty_devices import clock_at
 from hypothesis import given
 from hypothesis import strategies as st
+from refused import assert_raises, assert_refused
 
 from dbthermal import correction
 from dbthermal.instruments import v4l2
@@ -189,8 +190,7 @@ def test_no_frame_in_time() -> None:
     """An announced frame that is missing is no lost frame."""
     driver = Driver(answers=[(-1, 0, 0, 0)])
     with opened(driver) as capture:
-        with pytest.raises(NoFrameError, match="No frame from '/dev/video0'"):
-            capture.read(0.1)
+        assert_raises(NoFrameError, "No frame from '/dev/video0'", capture.read, 0.1)
         driver.answers = [(-1, 0, 0, 0), (BYTES, GOOD, 0, 5)]  # announced, and there a little later
         assert capture.read(0.1).sequence == 5
 
@@ -205,8 +205,7 @@ def test_frames_that_are_never_there_do_not_prolong_the_wait() -> None:
         return [3], [], []
 
     with v4l2.Capture("/dev/video0", STREAM, replace(kernel, select=select)) as capture:
-        with pytest.raises(NoFrameError, match="No frame from '/dev/video0'"):
-            capture.read(0.1)
+        assert_raises(NoFrameError, "No frame from '/dev/video0'", capture.read, 0.1)
         assert len(driver.answers) > 180
 
 
@@ -223,8 +222,7 @@ def test_unplugging_is_told_and_close_still_works() -> None:
         capture.close()
     assert driver.files == set()
     assert all(memory.closed for memory in driver.maps)
-    with pytest.raises(SourceLostError, match="it is closed"):
-        capture.read()
+    assert_raises(SourceLostError, "it is closed", capture.read)
 
 
 def test_buffer_goes_back_whatever_happens(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -254,8 +252,7 @@ def test_buffer_goes_back_whatever_happens(monkeypatch: pytest.MonkeyPatch) -> N
 )
 def test_other_streams_are_refused(driver: Driver, message: str) -> None:
     """A format or rate other than the requested one raises a ValueError, and the node is closed."""
-    with pytest.raises(ValueError, match=message):
-        opened(driver)
+    assert_refused(message, opened, driver)
     assert driver.files == set()
 
 
@@ -302,10 +299,9 @@ def test_hardware_gives_frames_without_telemetry(monkeypatch: pytest.MonkeyPatch
 
 def test_it_has_neither_telemetry_nor_command_port() -> None:
     """A session with telemetry or a command port raises an error before a device is opened."""
-    with pytest.raises(
-        ValueError, match=r"telemetry_rows of band '8-14', a y16, 2\. Must be one of"
-    ):
-        session(telemetry_rows=2)
+    assert_refused(
+        r"telemetry_rows of band '8-14', a y16, 2\. Must be one of", session, telemetry_rows=2
+    )
     plain = session()
     with pytest.raises(ValueError, match="Invalid control of kind 'y16', which has none"):
         replace(plain.cameras["8-14"], control="serial:///dev/ttyACM0")

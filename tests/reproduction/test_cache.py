@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from refused import assert_refused
 
 from reproduction import cache
 
@@ -39,8 +40,7 @@ def test_a_result_is_computed_once(tmp_path: Path, marks: Path) -> None:
     experiment = cache.kept(counted, tmp_path)
     first = experiment(str(marks), 1.0, seed=1)
     for number in (1, 2):  # a failed call leaves none
-        with pytest.raises(ValueError, match="interrupted"):
-            experiment(str(marks), -1.0, 1)
+        assert_refused("interrupted", experiment, str(marks), -1.0, 1)
         assert calls(marks) == 1 + number
     again = cache.kept(counted, tmp_path)(str(marks), value=1.0, seed=1)
     xr.testing.assert_identical(first, again)
@@ -122,5 +122,4 @@ def test_grid_of_results() -> None:
     coords: dict[str, list[float]] = {"noise": [0.1, 0.2], "seed": [1, 2, 3]}
     together = cache.gridded(results, coords)
     assert float(together["value"].sel(noise=0.2, seed=1)) == 3.0
-    with pytest.raises(ValueError, match=r"Invalid number of results 5\. Must be 6\."):
-        cache.gridded(results[:5], coords)
+    assert_refused(r"Invalid number of results 5\. Must be 6\.", cache.gridded, results[:5], coords)

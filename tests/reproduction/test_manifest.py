@@ -12,6 +12,7 @@ from pathlib import Path
 from urllib.parse import quote, unquote
 
 import pytest
+from refused import assert_raises, assert_refused
 
 from reproduction import locked, manifest
 
@@ -147,8 +148,7 @@ def test_a_mirror_with_a_fault(
     (copies / "two.txt").write_bytes(b"seconds")
     got, expected = (hashlib.sha256(text).hexdigest() for text in (b"seconds", b"second"))
     for read in (manifest.local, manifest.fetch_collection):
-        with pytest.raises(ValueError, match=rf"two\.txt': {got}. Must be {expected}"):
-            read("notes")
+        assert_refused(rf"two\.txt': {got}. Must be {expected}", read, "notes")
     (copies / "two.txt").unlink()
     assert not manifest.available("notes")
     with pytest.raises(FileNotFoundError, match=r"Missing 1 of 2 files of 'notes'.*'two\.txt'"):
@@ -164,8 +164,7 @@ def test_a_mirror_with_a_fault(
 def test_download(served: Path, project: Path) -> None:
     """`fetch_collection` alone takes files from their origin, once; altered ones are removed."""
     assert not manifest.available("notes")
-    with pytest.raises(FileNotFoundError, match="Missing 2 of 2 files"):
-        manifest.local("notes")
+    assert_raises(FileNotFoundError, "Missing 2 of 2 files", manifest.local, "notes")
     assert not (project / "data").exists()
     (served / "two.txt").write_bytes(b"SECOND")
     with pytest.raises(ValueError, match=rf"two\.txt.*{hashlib.sha256(b'second').hexdigest()}"):
@@ -202,8 +201,7 @@ def test_a_download_that_misbehaves(
             edit(project, size, "bytes: 1000")
         for limit, value in (("_SLOWEST", 5000), ("_TIMEOUT", 0.3)):
             monkeypatch.setattr(manifest, limit, value)
-    with pytest.raises(OSError, match=message):
-        manifest.fetch_collection("notes")
+    assert_raises(OSError, message, manifest.fetch_collection, "notes")
     assert not any((project / "data" / "notes").iterdir())
 
 
@@ -247,8 +245,7 @@ def test_main(
 def test_a_malformed_list_is_refused(project: Path, old: str, new: str, message: str) -> None:
     """A malformed list raises an error with its name."""
     edit(project, old, new)
-    with pytest.raises(ValueError, match=rf"(?s)Invalid 'data_manifest\.yaml'.*{message}"):
-        manifest.load()
+    assert_refused(rf"(?s)Invalid 'data_manifest\.yaml'.*{message}", manifest.load)
 
 
 @pytest.mark.data

@@ -14,7 +14,7 @@ import pytest
 from hostile_files import coloured, video, wave
 from marks import long, slow
 from numpy.testing import assert_allclose, assert_array_equal
-from refused import refused
+from refused import assert_refused, refused
 
 from dbthermal import store
 from reproduction import palettes
@@ -59,8 +59,7 @@ def test_masked_palette_video(tmp_path: Path) -> None:
             palettes.masked_palette_video(masked, width=width)
     with pytest.raises(ValueError, match=r"Palette 'plasma' does not fit.*from 'turbo'"):
         palettes.masked_palette_video(masked, "plasma")
-    with pytest.raises(ValueError, match=r"No coloured pixel in 'gray\.mp4'"):
-        palettes.masked_palette_video(gray)
+    assert_refused(r"No coloured pixel in 'gray\.mp4'", palettes.masked_palette_video, gray)
 
 
 PALETTES = [(name, f"Palette '{name}' does not fit.*from 'plasma'") for name in ("turbo", "gray")]
@@ -136,8 +135,7 @@ def test_marked_frames_are_refused(tmp_path: Path) -> None:
             continue
         if any(frame.is_corrupt for frame in frames):
             marked += 1
-            with pytest.raises(ValueError, match=r"is marked corrupt|Truncated|Damaged"):
-                palettes.palette_video(path)
+            assert_refused(r"is marked corrupt|Truncated|Damaged", palettes.palette_video, path)
     assert marked > 2
 
 
@@ -176,8 +174,7 @@ def test_declared_frames_are_counted(tmp_path: Path) -> None:
         (whole[: index - 900] + bytes(900) + whole[index:], "Damaged video 'a.mp4': .* Must deco"),
     ):
         path.write_bytes(changed)
-        with pytest.raises(ValueError, match=message):
-            palettes.palette_video(path)
+        assert_refused(message, palettes.palette_video, path)
 
 
 PLAYLISTS = (
@@ -206,8 +203,7 @@ def test_addresses_are_no_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         with pytest.raises(FileNotFoundError, match=re.escape(name.split("/")[-1])):
             palettes.palette_video(name)
     for path in (tmp_path, "/dev/zero"):
-        with pytest.raises(ValueError, match="Must be a regular file"):
-            palettes.palette_video(path)
+        assert_refused("Must be a regular file", palettes.palette_video, path)
 
 
 def test_what_a_file_names_is_not_opened(tmp_path: Path) -> None:

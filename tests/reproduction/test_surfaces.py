@@ -6,6 +6,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import trimesh
+from refused import assert_refused
 
 from reproduction.twins import bodies, surfaces
 from reproduction.twins.panes import pointing
@@ -99,10 +100,8 @@ def test_capsule_lies_between_its_ends(end: tuple[float, float, float]) -> None:
 
 def test_wrong_sizes() -> None:
     """A size that is not positive raises an error."""
-    with pytest.raises(ValueError, match=r"Invalid length and spacing .m. 0.0"):
-        surfaces.plate(0.0, 0.1, 0.01)
-    with pytest.raises(ValueError, match=r"Invalid .* spacing .m. nan"):
-        surfaces.ellipsoid((1, 1, 1), (0, 0, 0), np.nan)
+    assert_refused(r"Invalid length and spacing .m. 0.0", surfaces.plate, 0.0, 0.1, 0.01)
+    assert_refused(r"Invalid .* spacing .m. nan", surfaces.ellipsoid, (1, 1, 1), (0, 0, 0), np.nan)
 
 
 def test_rabbit_sits_on_the_table() -> None:
