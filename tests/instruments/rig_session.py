@@ -89,8 +89,12 @@ def pictures(world: World) -> dict[str, Picture]:
 
 
 @contextmanager
-def rig(session: Session, world: World | None = None) -> Iterator[Devices]:
-    """Devices of an emulated session, with its pictures."""
+def rig(
+    session: Session, world: World | None = None, *, prepared: bool = False
+) -> Iterator[Devices]:
+    """Devices of an emulated session, with its pictures; also prepared for a measurement."""
     world = bench(session) if world is None else world
     with open_devices(session, world, pictures(world)) as devices:
+        if prepared:
+            devices.prepare()
         yield devices

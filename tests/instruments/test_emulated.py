@@ -21,6 +21,7 @@ import pytest
 import rig_session
 from faulty_camera import frames
 from faulty_devices import clock_at
+from refused import assert_raises, assert_refused
 from rig_session import LIMIT, bench, from_yaml, replaced, rig, scene_text
 
 from dbthermal.instruments import protocols, telemetry
@@ -115,14 +116,11 @@ def test_what_does_not_fit_the_bench_is_named() -> None:
         (lambda: world.thermocouple_temperature(4), "Unknown place of thermocouple 4 'moon'"),
     ]
     for call, message in refusals:
-        with pytest.raises(KeyError, match=message):
-            call()
-    with pytest.raises(ValueError, match="Repeated camera 'wide'"):
-        world.add_camera("wide", 2)
+        assert_raises(KeyError, message, call)
+    assert_refused("Repeated camera 'wide'", world.add_camera, "wide", 2)
     for picture in (np.zeros((3, 4), dtype=np.uint16), np.zeros(SHAPE)):
         source.pictures = {"12": Mock(return_value=picture)}
-        with pytest.raises(ValueError, match=r"Invalid picture .* Must be \(8, 80\) of uint16"):
-            source.read()
+        assert_refused(r"Invalid picture .* Must be \(8, 80\) of uint16", source.read)
 
 
 LIMITS = Limits(chunk=30, reserve=0, queue=3)
@@ -139,13 +137,11 @@ def recorded(folder: Path) -> dict[str, str]:
     def show(preview: Preview) -> None:
         order.append(preview.time)
 
-    with rig(SWEEP) as devices:
-        devices.prepare()
+    with rig(SWEEP, prepared=True) as devices:
         heat = partial(setattr, devices.world, "blackbody_temperature")
         options: Any = {"set_temperature": heat, "limits": LIMITS, "preview": show}
         protocols.record_sweep(devices, folder, **options)
-    with rig(SCENE) as devices:
-        devices.prepare()
+    with rig(SCENE, prepared=True) as devices:
         protocols.record_scene(devices, folder / "scene.zarr", limits=LIMITS, preview=show)
     files = {
         str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()

@@ -14,6 +14,7 @@ import pytest
 import xarray as xr
 from faulty_camera import BANDS, two_bands, two_cameras
 from file_operations import before_operation, operations_of
+from marks import slow
 from rig_session import LIMIT
 from test_capture_file import CaptureFile, Note, begun, shot
 
@@ -92,9 +93,7 @@ def check_written(opened: xr.Dataset) -> list[int]:
     return written
 
 
-@pytest.mark.parametrize(
-    "share", [*MOMENTS, *(pytest.param(p, marks=pytest.mark.slow) for p in np.linspace(0.1, 1, 19))]
-)
+@pytest.mark.parametrize("share", [*MOMENTS, *slow(*np.linspace(0.1, 1, 19))])
 def test_kill_costs_the_last_chunk(tmp_path: Path, share: float) -> None:
     """Killed at any moment, a recording opens and lacks less than a chunk of each band."""
     taken, path = killed(tmp_path, share), tmp_path / "killed.zarr"

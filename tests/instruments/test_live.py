@@ -8,6 +8,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import xarray as xr
+from captures import people
 from faulty_camera import BANDS
 from rig_session import LEVELS, QUICK, from_yaml, rig, scene_text
 
@@ -224,15 +225,13 @@ def test_labels_and_room() -> None:
 def test_a_separation_is_shown_beside_the_frames() -> None:
     """Previews of both bands go through the correction into a stream; what is known is drawn."""
     rig, rng, rate = Rig(), np.random.default_rng(1), 10.0
-    glass = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(rig.bands)})
-    scene = simulation.walkers(np.arange(150) / rate, (12, 16), glass, rng)
-    capture, response = simulation.observe(scene, rig.response(), rng), rig.response()
+    scene, capture = people(rng, 150, (12, 16))
     detector = simulation.pattern(rig, (12, 16), rng)
     raw = simulation.capture(capture, detector)["counts"]
     gain = 1.0 / detector["gain"]
     dead = detector["dead"].any("band") * np.uint32(schema.Status.DEAD_PIXEL)
     template = capture.isel(time=[0]).assign(status=dead.astype(np.uint32))
-    stream = Stream(template, response, frame_rate=rate, refresh=2.0)
+    stream = Stream(template, rig.response(), frame_rate=rate, refresh=2.0)
     correction = xr.Dataset({"gain": gain, "offset": -detector["offset"] * gain})
     separation = live.Separation(stream, correction)
     view = live.View(is_simulated=True, separation=separation)
@@ -266,8 +265,7 @@ def test_a_separation_is_shown_beside_the_frames() -> None:
 def test_recording_without_a_notebook(tmp_path: Path) -> None:
     """Two emulated cameras are watched from within a recording, each by its own frames."""
     view = live.View(title="test", is_simulated=True)
-    with rig(from_yaml(scene_text().replace("0.15", "1.5"))) as devices:
-        devices.prepare()
+    with rig(from_yaml(scene_text().replace("0.15", "1.5")), prepared=True) as devices:
         protocols.record_scene(devices, tmp_path / "a.zarr", limits=QUICK, preview=view)
     for band, sample in view.status.items():
         assert (sample.lowest, sample.highest) == (LEVELS[band] + 2962, LEVELS[band] + 2963)

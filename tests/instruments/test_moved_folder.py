@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from faulty_camera import BANDS
 from file_operations import before_operation, operations_of
+from refused import assert_raises
 from rig_session import from_yaml, rig
 from test_capture_file import Note, begun, shot
 from test_killed import check
@@ -148,8 +149,7 @@ def test_without_a_chunk_it_is_not_complete(tmp_path: Path, piece: str) -> None:
         if number == 8:
             shutil.rmtree(gone) if gone.is_dir() else gone.unlink()
 
-    with pytest.raises(FileNotFoundError, match=rf"{piece}.*'"):
-        write(path, lose)
+    assert_raises(FileNotFoundError, rf"{piece}.*'", write, path, lose)
     with pytest.raises(ValueError, match=f"Missing file '{piece}"):
         store.open_dataset(path)
 
@@ -191,8 +191,7 @@ def test_a_folder_that_is_moved_while_it_is_looked_for(
     monkeypatch.setattr(os.path, "realpath", moving)
     assert folder.place() == tmp_path / "d"
     (tmp_path / "d").rmdir()
-    with pytest.raises(FileNotFoundError, match="was deleted"):
-        folder.place()
+    assert_raises(FileNotFoundError, "was deleted", folder.place)
 
 
 def test_a_sweep_follows_its_folder(tmp_path: Path) -> None:
@@ -203,8 +202,7 @@ def test_a_sweep_follows_its_folder(tmp_path: Path) -> None:
         if (before / "plate_00_11.zarr").exists():
             before.rename(after)
 
-    with rig(from_yaml(TWO)) as devices:
-        devices.prepare()
+    with rig(from_yaml(TWO), prepared=True) as devices:
         steps = swept(devices, before, preview=move)
     assert [step.path.parent for step in steps] == [before, after, after, after]
     assert open_sweep(after, "plate", frames=5).sizes["temperature"] == 2

@@ -54,8 +54,7 @@ def swept(
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Summary]]:
     """Record two temperatures through two filters."""
     folder = tmp_path_factory.mktemp("sweep")
-    with rig(from_yaml(TWO)) as devices:
-        devices.prepare()
+    with rig(from_yaml(TWO), prepared=True) as devices:
         return folder, swept(devices, folder)
 
 
@@ -124,8 +123,7 @@ def test_interrupted_sweep_goes_on(tmp_path: Path) -> None:
         if len(log) > 1:
             raise KeyboardInterrupt
 
-    with rig(from_yaml(TWO)) as devices:
-        devices.prepare()
+    with rig(from_yaml(TWO), prepared=True) as devices:
         with pytest.raises(KeyboardInterrupt):
             swept(devices, tmp_path, log, preview=interrupt)
         cut = tmp_path / "plate_01_9.5.zarr"
@@ -150,8 +148,7 @@ def test_interrupted_sweep_goes_on(tmp_path: Path) -> None:
 
 def test_a_step_must_be_of_one_state(tmp_path: Path) -> None:
     """A wheel or a blackbody that moves during a step is an error, at once or on opening it."""
-    with rig(from_yaml(ONE)) as devices:
-        devices.prepare()
+    with rig(from_yaml(ONE), prepared=True) as devices:
         wheel = devices.wheel
         assert wheel is not None
         for _ in range(2):
@@ -184,8 +181,7 @@ def test_sweep_without_a_wheel(tmp_path: Path) -> None:
     """Two cameras of fixed bands have one recording at each temperature."""
     words = ("filter", "wheel", "sweep")
     lines = [line for line in ONE.splitlines() if not any(word in line for word in words)]
-    with rig(from_yaml("\n".join(lines))) as devices:
-        devices.prepare()
+    with rig(from_yaml("\n".join(lines)), prepared=True) as devices:
         steps = swept(devices, tmp_path)
     assert [step.path.name for step in steps] == ["plate_00.zarr"]
     movies = recording.open_sweep(tmp_path, "plate", frames=8)
@@ -247,8 +243,7 @@ def test_a_short_recording_is_named(tmp_path: Path) -> None:
     """A recording that is short in a band, or was cut, is named with good and promised frames."""
     session = from_yaml(replaced(("duration: 0.15", "duration: 0.5"), text=scene_text()))
     for name, frames in (("whole", 10_000), ("short", 29)):
-        with rig(session) as devices:
-            devices.prepare()
+        with rig(session, prepared=True) as devices:
             short = faulty(devices, "9.5", Faults(corrupt=frozenset(range(frames, 10_000))))
             path = tmp_path / name / f"{name}.zarr"
             protocols.record_scene(short, path, limits=QUICK)
