@@ -6,17 +6,15 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import xarray as xr
-from captures import emissivity_of
+from captures import GLASS, RIG
 from scenes import held
 from worlds import RESPONSE, World, seen
 
 from dbthermal import separation, simulation
 from dbthermal.schema import Status
-from dbthermal.simulation import Background, Rig
+from dbthermal.simulation import Background
 from reproduction.experiments.cases import independent_pixels
 
-RIG = Rig()
-GLASS = emissivity_of(0.86, 0.72)
 FRAME = np.arange(350.0)
 EVEN = FRAME / 10.0  # s
 
@@ -125,18 +123,23 @@ def test_a_jump_beside_a_pause_is_found(place: int) -> None:
         assert held(result.isel(time=[place]), moved) > 0.85  # of 100 pixels
 
 
+def peak(scene: xr.Dataset, frame: int, rng: np.random.Generator) -> int:
+    """Most memory [byte] by which a scene is separated whose object steps at a frame."""
+    step = 6.0 * (scene["time"] >= scene["time"][frame])  # every clock asks for pieces of time
+    moved = scene.assign(object_temperature=scene["object_temperature"] + step)
+    capture = simulation.observe(moved, RIG.response(), rng)
+    tracemalloc.start()
+    separation.solve(capture, RIG.response())
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return most
+
+
 def test_memory_is_that_of_the_frames() -> None:
     """A clock of nanoseconds, or with a pause of 30 years, takes no more memory than another."""
-    peaks = []
-    for time in (EVEN, CLOCKS["nanoseconds"], CLOCKS["a pause of 30 years"]):
-        scene, _ = seen_at(time, 50, seed=1)
-        step = 6.0 * (scene["time"] >= time[100])  # so that every clock asks for pieces of time
-        moved = scene.assign(object_temperature=scene["object_temperature"] + step)
-        capture = simulation.observe(moved, RIG.response(), np.random.default_rng(7))
-        tracemalloc.start()
-        separation.solve(capture, RIG.response())
-        peaks.append(tracemalloc.get_traced_memory()[1])
-        tracemalloc.stop()
+    clocks = EVEN, CLOCKS["nanoseconds"], CLOCKS["a pause of 30 years"]
+    scenes = [seen_at(time, 50, seed=1)[0] for time in clocks]
+    peaks = [peak(scene, 100, np.random.default_rng(7)) for scene in scenes]
     assert max(peaks) < 1.5 * peaks[0]
 
 
@@ -145,14 +148,7 @@ def test_memory_grows_with_the_frames_and_not_with_their_square() -> None:
     peaks = []
     for frames in (3000, 12000):
         time, rng = np.arange(frames) / 10.0, np.random.default_rng(1)
-        scene = simulation.walkers(time, (4, 4), GLASS, rng)
-        step = 6.0 * (scene["time"] >= time[1000])
-        moved = scene.assign(object_temperature=scene["object_temperature"] + step)
-        capture = simulation.observe(moved, RIG.response(), rng)
-        tracemalloc.start()
-        separation.solve(capture, RIG.response())
-        peaks.append(tracemalloc.get_traced_memory()[1])
-        tracemalloc.stop()
+        peaks.append(peak(simulation.walkers(time, (4, 4), GLASS, rng), 1000, rng))
     print(f"peaks [byte]: {peaks}")
     assert peaks[1] < 6.0 * peaks[0]
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from captures import emissivity_of
-from scenes import field, held
+from scenes import field, held, painted
 from worlds import World, seen
 
 from dbthermal import emissivity as emissivity_module
@@ -26,10 +26,8 @@ Case = tuple[xr.Dataset, xr.Dataset, xr.Dataset]
 
 def draw(picture: Picture, seed: int, *emissivity: float) -> Case:
     """Scene, capture, and result alone."""
-    rng = np.random.default_rng(seed)
-    scene = picture.draw(TIME, emissivity_of(*emissivity), rng)
-    capture = observe(scene, RESPONSE, rng)
-    return scene, capture, separation.solve(capture, RESPONSE)
+    scene = painted(seed, emissivity, picture, time=TIME)
+    return scene.truth, scene.capture, separation.solve(scene.capture, RESPONSE)
 
 
 @pytest.fixture(scope="module")

@@ -16,6 +16,7 @@ from types import CodeType, FrameType
 import numpy as np
 import pytest
 import xarray as xr
+from captures import GLASS
 from scenes import Shelf
 
 import dbthermal
@@ -74,8 +75,7 @@ def returns(way: list[Function]) -> list[str]:
 def test_way_of_the_data_is_short(jump: float) -> None:
     """The default method crosses at most 14 modules, with at most 8 returns."""
     rig, rng = simulation.Rig(), np.random.default_rng(1)
-    emissivity = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(rig.bands)})
-    scene = simulation.walkers(np.arange(200) / 10.0, (8, 16), emissivity, rng, crossings=3)
+    scene = simulation.walkers(np.arange(200) / 10.0, (8, 16), GLASS, rng, crossings=3)
     step = jump * (scene["time"] > 10.0)
     moved = scene.assign(object_temperature=scene["object_temperature"] + step)
     capture = simulation.observe(moved, rig.response(), rng)

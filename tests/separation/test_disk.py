@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
+from captures import GLASS, RIG, people, plain_capture
 
 from dbthermal import correction, separation, simulation, store
 from dbthermal.separation import _run
@@ -22,7 +23,6 @@ from reproduction import benchmark
 from reproduction.benchmark import peak_memory
 from reproduction.experiments import whole
 
-RIG = simulation.Rig()
 TIME = np.arange(64) / 10.0  # s
 # Nine rows in a block [byte].
 MEMORY = _run.BASE + 9 * (_run._READ + _run._SAMPLE + _run._TILE) * 2 * 64 * 24
@@ -32,10 +32,7 @@ OPTIONS: dict[str, Any] = {"memory": MEMORY, "provenance": {"run of": "a test"}}
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A capture of 41 rows on disk, with lost samples, bad pixels and a shutter event."""
-    rng = np.random.default_rng(1)
-    glass = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(RIG.bands)})
-    scene = simulation.walkers(TIME, (41, 24), glass, rng, crossings=3)
-    capture = simulation.observe(scene, RIG.response(), rng)
+    _, capture = people(1, TIME.size, (41, 24), crossings=3)
     capture["counts"][:, 20] = np.nan
     capture["status"] = (("y", "x"), np.zeros((41, 24), dtype=np.uint32))
     capture["status"][3, 4] = 1 << 10
@@ -62,14 +59,19 @@ def rest(path: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return target
 
 
+def assert_solved(target: Path, capture: xr.Dataset, *arguments: Any, **options: Any) -> None:
+    """Assert that a store holds what `solve` gives of a capture."""
+    result = store.open_dataset(target).load().drop_attrs()
+    expected = separation.solve(capture, *arguments, **options).drop_attrs()
+    xr.testing.assert_identical(result, expected)
+
+
 def test_run_is_solve(path: Path, tmp_path: Path) -> None:
     """Block by block the result is that of the whole capture in memory, and no part is left."""
     response, target = RIG.response().drop_vars(["noise", "netd"]), tmp_path / "result.zarr"
     separation.run(path, target, response, memory=MEMORY)
-    result = store.open_dataset(target)
-    expected = separation.solve(store.open_dataset(path).load(), response)
-    xr.testing.assert_identical(result.load().drop_attrs(), expected.drop_attrs())
-    assert result.attrs["method"] == "subspace"
+    assert_solved(target, store.open_dataset(path).load(), response)
+    assert store.open_dataset(target).attrs["method"] == "subspace"
     assert [one.name for one in tmp_path.iterdir()] == ["result.zarr"]
 
 
@@ -82,9 +84,7 @@ def test_maps_are_cut_by_rows(path: Path, tmp_path: Path) -> None:
     maps: dict[str, Any] = {"emissivity": known, "mask": mask}
     target = tmp_path / "result.zarr"
     separation.run(path, target, response, "calibrated", memory=MEMORY, **maps)
-    expected = separation.solve(store.open_dataset(path).load(), response, "calibrated", **maps)
-    result = store.open_dataset(target).load()
-    xr.testing.assert_identical(result.drop_attrs(), expected.drop_attrs())
+    assert_solved(target, store.open_dataset(path).load(), response, "calibrated", **maps)
 
 
 def peak(source: Path, target: Path, memory: float) -> float:
@@ -97,9 +97,7 @@ def peak(source: Path, target: Path, memory: float) -> float:
 def test_memory_is_the_limit_of_a_process(tmp_path: Path) -> None:
     """Of 200 MB of counts a process that may take 700 MB takes no more, its programs included."""
     flat = benchmark.capture(81920, 300, 2)["counts"].values.reshape(2, 300, 128, 640)
-    movie = {"counts": (("band", "time", "y", "x"), flat, {"units": "count"})}
-    coords = {"band": list(RIG.bands), "time": np.arange(300) / 10.0}
-    store.save(xr.Dataset(movie, coords), tmp_path / "all.zarr", {})
+    store.save(plain_capture(flat), tmp_path / "all.zarr", {})
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as fresh:
         found = fresh.submit(peak, tmp_path / "all.zarr", tmp_path / "result.zarr", 7e8).result()
     print(f"{found / 1e6:.0f} MB")
@@ -124,9 +122,8 @@ def test_several_captures_are_one_call(path: Path, tmp_path: Path) -> None:
     (error,) = caught.value.exceptions
     assert isinstance(error, ValueError)
     assert "second.zarr" in error.__notes__[0]
-    expected = separation.solve(capture.isel(y=slice(9)), response)
+    assert_solved(targets[2], capture.isel(y=slice(9)), response)
     result = store.open_dataset(targets[2]).load()
-    xr.testing.assert_identical(result.drop_attrs(), expected.drop_attrs())
     before = [(target / "zarr.json").stat().st_mtime_ns for target in (targets[0], targets[2])]
     store.save(capture.isel(y=slice(9)), tmp_path / "broken.zarr", {})
     separation.run(sources, targets, response, memory=MEMORY)
@@ -179,9 +176,7 @@ def test_a_source_of_other_values_is_another(path: Path, tmp_path: Path, kind: s
         made = (target / "zarr.json").stat().st_mtime_ns
         separation.run(opened(), target, RIG.response())
         assert (target / "zarr.json").stat().st_mtime_ns == made
-        expected = separation.solve(capture, RIG.response())
-        result = store.open_dataset(target).load()
-        xr.testing.assert_identical(result.drop_attrs(), expected.drop_attrs())
+        assert_solved(target, capture, RIG.response())
 
 
 @pytest.mark.parametrize("rows", [16, 3, (5, 13, 23)], ids=str)
@@ -201,9 +196,7 @@ def test_chunks_of_dask_are_read_once(path: Path, tmp_path: Path, rows: Any) -> 
     read.clear()
     most = MEMORY + 4 * _run._READ * 41 * 2 * 64 * 24
     separation.run(lazy, tmp_path / "result.zarr", RIG.response(), memory=most)
-    result = store.open_dataset(tmp_path / "result.zarr").load()
-    expected = separation.solve(held, RIG.response())
-    xr.testing.assert_identical(result.drop_attrs(), expected.drop_attrs())
+    assert_solved(tmp_path / "result.zarr", held, RIG.response())
     times = max(np.unique(read, return_counts=True)[1])
     # Twice more for a few pixels: by which the capture is known again, and to check it.
     assert times <= (4 if isinstance(rows, tuple) else 3)
@@ -212,8 +205,7 @@ def test_chunks_of_dask_are_read_once(path: Path, tmp_path: Path, rows: Any) -> 
 def test_raw_counts_are_corrected_by_rows(tmp_path: Path) -> None:
     """A raw capture on disk, corrected when it is read, is separated as if corrected before."""
     rng, shape = np.random.default_rng(3), (41, 24)
-    glass = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(RIG.bands)})
-    scene = simulation.walkers(TIME, shape, glass, rng, crossings=3)
+    scene = simulation.walkers(TIME, shape, GLASS, rng, crossings=3)
     detector = simulation.pattern(RIG, shape, rng)
     movies = simulation.blackbody_movies(RIG, np.linspace(275.0, 345.0, 6), 16, detector, rng)
     fitted, response = whole.calibrate(movies)
@@ -222,9 +214,7 @@ def test_raw_counts_are_corrected_by_rows(tmp_path: Path) -> None:
     raw = store.open_dataset(tmp_path / "raw.zarr")
     corrected = correction.correct_capture(raw, fitted, lazy=True)
     separation.run(corrected, tmp_path / "result.zarr", response, memory=MEMORY)
-    expected = separation.solve(corrected.load(), response)
-    result = store.open_dataset(tmp_path / "result.zarr").load()
-    xr.testing.assert_identical(result.drop_attrs(), expected.drop_attrs())
+    assert_solved(tmp_path / "result.zarr", corrected.load(), response)
 
 
 @pytest.mark.slow

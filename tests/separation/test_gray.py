@@ -4,7 +4,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import xarray as xr
-from attack.scenes import counts_of
+from attack.scenes import blackbody, counts_of
+from captures import plain_capture
+from marks import slow
 
 from dbthermal import calibration, separation, simulation
 from dbthermal.response import EXACT
@@ -62,19 +64,15 @@ def independent(noise: tuple[float, ...], emissivity: Floats, seed: int, frames:
         for name, e, std, step in zip(names, emissivity, noise, steps, strict=True)
     ]
     label = {"band": list(names)}
-    grid = np.linspace(263.15, 353.15, 19)
-    seen = [counts_of(name, grid) for name in names]
-    blackbody = xr.DataArray(seen, label | {"temperature": grid}, ("band", "temperature"))
     levels = xr.DataArray(np.array(noise) * steps, dims="band", coords=label)
-    response = calibration.fit_response(blackbody, levels, **EXACT)
+    sweep = blackbody(names, np.linspace(263.15, 353.15, 19))
+    response = calibration.fit_response(sweep, levels, **EXACT)
     value = xr.DataArray(emissivity[:, np.newaxis], dims=("band", "y", "x"), coords=label)
     scene = simulation.scene(time, x[:, np.newaxis], y[:, np.newaxis], value)
-    capture = xr.Dataset(
-        {"counts": (("band", "time", "y", "x"), np.stack(counts)[:, :, np.newaxis])},
-        coords=label | {"time": ("time", time, {"units": "s"}), "y": [0], "x": np.arange(pixels)},
+    capture = plain_capture(
+        np.stack(counts)[:, :, np.newaxis], ("time", time, {"units": "s"}), names
     )
-    capture["counts"].attrs["units"] = "count"
-    return scene, capture, response
+    return scene, capture.assign_coords(y=[0], x=np.arange(pixels)), response
 
 
 def simulated(noise: tuple[float, ...], emissivity: Floats, seed: int, frames: int = 350) -> Case:
@@ -101,11 +99,7 @@ def judge(scene: xr.Dataset, result: xr.Dataset) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("generator", GENERATORS)
-@pytest.mark.parametrize(
-    "noise",
-    [(0.03, 0.03), pytest.param((0.03, 0.1, 0.1), marks=pytest.mark.slow), (0.03,) * 5],
-    ids=str,
-)
+@pytest.mark.parametrize("noise", [(0.03, 0.03), *slow(((0.03, 0.1, 0.1),)), (0.03,) * 5], ids=str)
 def test_gray_bodies_have_a_flag(noise: tuple[float, ...], generator: str) -> None:
     """At most one gray pixel in a thousand is wrong without a flag, in quiet and in many bands."""
     scene, capture, response = GENERATORS[generator](noise, gray(len(noise), 500, 1), seed=2)

@@ -3,21 +3,17 @@
 import numpy as np
 import pytest
 import xarray as xr
-from captures import emissivity_of
-from scenes import Scene, heard, observed
+from captures import RIG, people
+from scenes import Scene, heard
 from worlds import RESPONSE, World, seen
 
-from dbthermal import calibration, schema, separation, simulation
-
-RIG = simulation.Rig()
+from dbthermal import calibration, schema, separation
 
 
 @pytest.fixture(scope="module")
 def glass_plate() -> Scene:
     """Glass before which people walk by, seen by two cameras whose noises in counts are alike."""
-    rng = np.random.default_rng(1)
-    truth = simulation.walkers(np.arange(100) / 10, (12, 16), emissivity_of(0.86, 0.72), rng)
-    return observed(truth, rng)
+    return Scene(*people(1, 100, (12, 16)), RIG.response())
 
 
 def said(capture: xr.Dataset, response: xr.Dataset) -> list[str]:

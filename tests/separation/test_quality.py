@@ -4,12 +4,13 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import xarray as xr
+from captures import RIG, plain_capture
+from marks import long
 
 from dbthermal import separation
 from dbthermal.schema import Status
-from dbthermal.simulation import Rig
 
-FRAMES, PIXELS, RIG = 20, 6, Rig()
+FRAMES, PIXELS = 20, 6
 Place = tuple[int | slice, int | slice, int]
 CHECKED = np.uint32(
     Status.INVALID_SAMPLES | Status.CONSTANT_SIGNAL | Status.FROZEN_FRAMES | Status.SATURATED
@@ -18,11 +19,7 @@ CHECKED = np.uint32(
 
 def capture_of(counts: npt.NDArray[np.float64]) -> xr.Dataset:
     """Capture one row high of counts (band, time, pixel)."""
-    dims = ("band", "time", "y", "x")
-    return xr.Dataset(
-        {"counts": (dims, counts[:, :, np.newaxis].astype(np.float32), {"units": "count"})},
-        {"band": list(RIG.bands), "time": np.arange(counts.shape[1]) / 10.0},
-    )
+    return plain_capture(counts[:, :, np.newaxis].astype(np.float32))
 
 
 def plain() -> npt.NDArray[np.float64]:
@@ -84,10 +81,7 @@ def test_copies_of_a_frame_are_left_out(copies: int, flag: int) -> None:
 @pytest.mark.parametrize(
     ("noise", "seeds"),
     [(noise, 2) for noise in (0.05, 0.3, 0.8, 1.2, 3.4, 30.0)]
-    + [
-        pytest.param(noise, 20, marks=pytest.mark.long)
-        for noise in (0.05, 0.1, 0.2, 0.3, 0.5, 0.8, 1.2, 2.0, 3.4, 30.0)
-    ],
+    + long(*((noise, 20) for noise in (0.05, 0.1, 0.2, 0.3, 0.5, 0.8, 1.2, 2.0, 3.4, 30.0))),
 )
 def test_whole_counts_repeat_by_chance(noise: float, seeds: int) -> None:
     """Of rounded counts that rest, rise and step, at most one in 1e3 of many has a flag."""

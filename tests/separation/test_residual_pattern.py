@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import xarray as xr
-from captures import emissivity_of
+from captures import GLASS
 from scenes import held
 
 from dbthermal import correction, separation, simulation
@@ -72,7 +72,7 @@ def test_a_flat_image_leaves_its_own_noise() -> None:
 def test_an_offset_moves_the_result_as_stated(band: str) -> None:
     """An offset of a count moves object and background by what it adds to the bars."""
     rng, response = np.random.default_rng(5), RIG.response()
-    scene = simulation.walkers(TIME[::3], (6, 8), emissivity_of(0.86, 0.72), rng)
+    scene = simulation.walkers(TIME[::3], (6, 8), GLASS, rng)
     capture = simulation.observe(scene, response, rng, dtype="float64")
     offset = xr.zeros_like(response["noise"])
     offset.loc[band] = 1.0  # [count]
@@ -90,7 +90,7 @@ def test_an_offset_moves_the_result_as_stated(band: str) -> None:
 def test_intervals_hold_the_residual_pattern() -> None:
     """After a calibration of 16 frames a step 92 to 98 % hold, far fewer without the term."""
     rng, response = np.random.default_rng(1), RIG.response()
-    scene = simulation.walkers(TIME, SHAPE, emissivity_of(0.86, 0.72), rng)
+    scene = simulation.walkers(TIME, SHAPE, GLASS, rng)
     detector, fitted = calibrated(1)
     raw = simulation.capture(simulation.observe(scene, response, rng), detector)
     corrected = correction.correct_capture(raw, fitted)

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
-from captures import emissivity_of
+from captures import FILMS, RIG, emissivity_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import held
@@ -20,7 +20,7 @@ from reproduction.experiments.cases import independent_pixels
 from reproduction.experiments.twins import reflected_change
 from reproduction.methods.dbvt import DbvtSettings
 
-RIG = Rig()
+RESPONSE = RIG.response()
 TIME = np.arange(350) / 10.0
 GLASS: dict[str, Any] = {"emissivity": [0.86, 0.72], "start": 20, "stop": 60}
 OBJECT = "object_temperature"
@@ -198,11 +198,9 @@ def test_no_background_raises_a_false_alarm(
 def test_an_object_as_linear_as_the_drift_has_wide_intervals(stop: int) -> None:
     """Where the object's own curve is nearly a line as well, the intervals are wide, not wrong."""
     rng = np.random.default_rng(3)
-    glass = xr.DataArray(GLASS["emissivity"], dims="band", coords={"band": list(RIG.bands)})
     background, response = simulation.Background(drift=8.0), RIG.response()
     ends: dict[str, Any] = {"start": 293.15, "stop": stop + 273.15, "time_constant": (25.0, 80.0)}
-    parts = (TIME, glass, background, 300, rng)
-    scene = independent_pixels(*parts, **ends)
+    scene = independent_pixels(TIME, emissivity_of(0.86, 0.72), background, 300, rng, **ends)
     share = coverage(scene, separation.solve(simulation.observe(scene, response, rng), response))
     assert np.all(share >= 0.92)
 
@@ -390,7 +388,7 @@ def test_differences_of_emissivities_are_as_certain_as_their_correlation_says() 
     rig, rng = Rig(bands=BANDS[:3], noise=NOISE[:3]), np.random.default_rng(3)
     warm, cold = 300.0 + 30.0 * (1.0 - np.exp(-TIME / 12.0)), 293.0 + 3.0 * ((TIME // 3.0) % 2)
     warm, cold = (np.broadcast_to(one[:, None, None], (350, 30, 50)) for one in (warm, cold))
-    value = xr.DataArray([0.86, 0.72, 0.79], dims="band", coords={"band": list(rig.bands)})
+    value = emissivity_of(0.86, 0.72, 0.79, bands=rig.bands)
     scene = simulation.scene(TIME, warm, cold, value)
     capture = simulation.observe(scene, rig.response(), rng)
     free = separation.SubspaceSettings(0.0)
@@ -556,14 +554,13 @@ def test_apparent_is_the_reading_of_the_quieter_band(glass: Case) -> None:
 
 
 PIXELS = 20
-FILMS = ("object_temperature", "background_temperature")
 INVALID = Status.INVALID_SAMPLES
 
 
 @pytest.fixture(scope="module")
-def twenty() -> Case:
-    """Scene, capture and response of 20 pixels of glass."""
-    return cases.simulate(GLASS, RIG, TIME, PIXELS, seed=1)
+def capture() -> xr.Dataset:
+    """Capture of 20 pixels of glass."""
+    return cases.simulate(GLASS, RIG, TIME, PIXELS, seed=1)[1]
 
 
 def without(capture: xr.Dataset, there: np.ndarray) -> xr.Dataset:
@@ -592,33 +589,32 @@ def lost(fraction: float, seed: int = 0) -> np.ndarray:
 @pytest.mark.parametrize(
     ("band", "value"), [([0], np.nan), ([1], np.inf), ([0, 1], -np.inf), ([0, 1], np.nan)]
 )
-def test_missing_frames_are_as_if_never_taken(twenty: Case, band: list[int], value: float) -> None:
+def test_missing_frames_are_as_if_never_taken(
+    capture: xr.Dataset, band: list[int], value: float
+) -> None:
     """Missing frames, in one band or both, leave all other frames' results as they are."""
-    _, capture, response = twenty
     frames = lost(0.1)
     spoilt = capture.copy(deep=True)
     for one in band:
         spoilt["counts"].values[one, ~frames] = value
-    expected = separation.solve(capture.isel(time=frames), response)
-    assert_agree(separation.solve(spoilt, response), expected, frames)
+    expected = separation.solve(capture.isel(time=frames), RESPONSE)
+    assert_agree(separation.solve(spoilt, RESPONSE), expected, frames)
 
 
 @pytest.mark.parametrize("noise_known", [True, False])
-def test_masks_of_frames(twenty: Case, noise_known: bool) -> None:
+def test_masks_of_frames(capture: xr.Dataset, noise_known: bool) -> None:
     """A mask over time is the capture without these frames, noise known or not."""
-    _, capture, response = twenty
-    response = response if noise_known else response.drop_vars(["noise", "netd"])
+    response = RESPONSE if noise_known else RESPONSE.drop_vars(["noise", "netd"])
     frames = lost(0.2, seed=3)
     found = separation.solve(capture, response, mask=xr.DataArray(frames, dims="time"))
     assert_agree(found, separation.solve(capture.isel(time=frames), response), frames)
 
 
-def test_masks_of_pixels(twenty: Case) -> None:
+def test_masks_of_pixels(capture: xr.Dataset) -> None:
     """Pixels that are masked are flagged and NaN, the others as they were."""
-    _, capture, response = twenty
     used = np.arange(PIXELS)[np.newaxis] % 3 > 0
-    found = separation.solve(capture, response, mask=xr.DataArray(used, dims=("y", "x")))
-    whole = separation.solve(capture, response)
+    found = separation.solve(capture, RESPONSE, mask=xr.DataArray(used, dims=("y", "x")))
+    whole = separation.solve(capture, RESPONSE)
     assert np.all(found["status"].values[~used] == INVALID)
     for name in schema.STAGES["separated"]:
         if name != "status":
@@ -628,47 +624,43 @@ def test_masks_of_pixels(twenty: Case) -> None:
         )
 
 
-def test_masks_of_samples_are_nan(twenty: Case) -> None:
+def test_masks_of_samples_are_nan(capture: xr.Dataset) -> None:
     """A mask of single samples is the same as NaN there, each pixel with its own frames."""
-    _, capture, response = twenty
     there = np.random.default_rng(4).random((350, 1, PIXELS)) > 0.25  # too many to be bridged
-    masked = separation.solve(capture, response, mask=xr.DataArray(there, dims=("time", "y", "x")))
-    spoilt = separation.solve(without(capture, there), response)
+    masked = separation.solve(capture, RESPONSE, mask=xr.DataArray(there, dims=("time", "y", "x")))
+    spoilt = separation.solve(without(capture, there), RESPONSE)
     xr.testing.assert_identical(masked, spoilt)
     assert np.all(np.isnan(masked["object_temperature"].values[~there]))
     assert np.all(np.isfinite(masked["object_temperature"].values[there]))
     pixel = capture.isel(x=[7]).isel(time=there[:, 0, 7])
-    alone = separation.solve(pixel, response)
+    alone = separation.solve(pixel, RESPONSE)
     assert_agree(masked.isel(x=[7]), alone, there[:, 0, 7])
 
 
 @pytest.mark.parametrize(("missing", "good"), [(170, True), (180, False)])
-def test_half_of_the_frames_must_be_there(twenty: Case, missing: int, good: bool) -> None:
+def test_half_of_the_frames_must_be_there(capture: xr.Dataset, missing: int, good: bool) -> None:
     """A pixel with less than half of its frames is NaN and flagged."""
-    _, capture, response = twenty
     there = np.ones((350, 1, PIXELS), dtype=bool)
     there[np.random.default_rng(5).permutation(350)[:missing], 0, 3] = False
-    result = separation.solve(without(capture, there), response)
+    result = separation.solve(without(capture, there), RESPONSE)
     assert bool(result["status"].values[0, 3] != INVALID) == good
     assert bool(np.any(np.isfinite(result["object_temperature"].values[:, 0, 3]))) == good
     assert not np.any(np.delete(result["status"].values[0], 3))
 
 
-def test_a_segment_without_a_step_costs_little(twenty: Case) -> None:
+def test_a_segment_without_a_step_costs_little(capture: xr.Dataset) -> None:
     """An event without a step changes the object by less than 0.15 K, and sets no flag."""
-    _, capture, response = twenty
-    plain = separation.solve(capture, response)
-    freed = separation.solve(capture.assign(segment=("time", np.repeat([3, 4], 175))), response)
+    plain = separation.solve(capture, RESPONSE)
+    freed = separation.solve(capture.assign(segment=("time", np.repeat([3, 4], 175))), RESPONSE)
     assert not np.any(freed["status"])
     apart = freed["object_temperature"] - plain["object_temperature"]
     assert float(np.sqrt((apart**2).mean())) < 0.15  # [K]
-    constant = separation.solve(capture.assign(segment=("time", np.full(350, 9))), response)
+    constant = separation.solve(capture.assign(segment=("time", np.full(350, 9))), RESPONSE)
     xr.testing.assert_identical(constant["object_temperature"], plain["object_temperature"])
 
 
-def test_unequal_gaps_need_a_known_noise(twenty: Case) -> None:
+def test_unequal_gaps_need_a_known_noise(capture: xr.Dataset) -> None:
     """Gaps in different frames of every pixel raise a ValueError that asks for the noise."""
-    _, capture, response = twenty
     there = np.random.default_rng(8).random((350, 1, PIXELS)) > 0.02
     with pytest.raises(ValueError, match=r"0 usable pixels .* or give the noise"):
-        separation.solve(without(capture, there), response.drop_vars(["noise", "netd"]))
+        separation.solve(without(capture, there), RESPONSE.drop_vars(["noise", "netd"]))

@@ -5,17 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from captures import emissivity_of
-from scenes import held
+from captures import GLASS, RIG, emissivity_of, plain_capture
+from scenes import held, painted
 
 from dbthermal import separation, simulation, store
 from dbthermal.simulation import Background
 from reproduction.experiments.cases import independent_pixels
 from reproduction.experiments.pictures import Picture, smooth_shift
 
-RIG = simulation.Rig()
 TIME = np.arange(300) / 10.0
-GLASS = emissivity_of(0.86, 0.72)
 SHAPE = (24, 32)
 
 
@@ -29,9 +27,8 @@ def stated(factor: float) -> xr.Dataset:
 @pytest.fixture(scope="module")
 def picture() -> tuple[xr.Dataset, xr.Dataset]:
     """Scene of walkers before glass, and its capture."""
-    rng = np.random.default_rng(31)
-    scene = Picture(SHAPE).draw(TIME, GLASS, rng)
-    return scene, simulation.observe(scene, RIG.response(), rng)
+    scene = painted(31, GLASS, Picture(SHAPE), time=TIME)
+    return scene.truth, scene.capture
 
 
 @pytest.mark.parametrize("factor", [1.15, 1.5, 2.0, 4.0])
@@ -100,9 +97,5 @@ def test_rounded_counts_of_less_noise_than_a_step() -> None:
     for step in (0.2, 0.5, 1.0, 2.0):
         exact = level + noise * rng.standard_normal((2, 300, 400))
         counts = (step * noise * np.rint(exact / (step * noise)))[:, :, np.newaxis]
-        capture = xr.Dataset(
-            {"counts": (("band", "time", "y", "x"), counts, {"units": "count"})},
-            {"band": list(RIG.bands), "time": TIME},
-        )
-        result = separation.solve(capture, response)
+        result = separation.solve(plain_capture(counts, TIME), response)
         assert result.attrs["noise_source"] == "response", step

@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import xarray as xr
+from captures import GLASS, emissivity_of, people
 from scenes import field, held
 
 from dbthermal import schema, simulation
@@ -19,10 +20,8 @@ Data = tuple[xr.Dataset, xr.Dataset, xr.Dataset]
 
 def walkers(seed: int, seconds: float, shape: tuple[int, int] = (12, 20), **rig: Any) -> Data:
     """Scene, capture and response of plate glass that warms up while people walk by."""
-    rng, made = np.random.default_rng(seed), Rig(**rig)
-    glass = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(made.bands)})
-    scene = simulation.walkers(np.arange(round(seconds * RATE)) / RATE, shape, glass, rng)
-    return scene, simulation.observe(scene, made.response(), rng), made.response()
+    made = Rig(**rig)
+    return *people(seed, round(seconds * RATE), shape, rig=made), made.response()
 
 
 def live(
@@ -93,10 +92,7 @@ def test_memory_does_not_grow_and_the_past_is_forgotten() -> None:
     stream = Stream(first.isel(time=[0]), response, frame_rate=RATE, memory=12.0)
     size = stream.nbytes
     stream.update(first["time"].values, first["counts"].values)
-    made = xr.DataArray([0.6, 0.45], dims="band", coords={"band": first["band"].values})
-    rng = np.random.default_rng(7)
-    scene = simulation.walkers(np.arange(600) / RATE, (12, 20), made, rng)
-    second = simulation.observe(scene, response, rng)
+    scene, second = people(7, 600, (12, 20), emissivity_of(0.6, 0.45))
     stream.update(second["time"].values[:300] + 60.0, second["counts"].values[:, :300])
     result = stream.result()
     good = result["status"] == 0
@@ -161,8 +157,7 @@ def test_rate_of_full_frames() -> None:
     from time import perf_counter, process_time  # noqa: PLC0415
 
     time, rng, made = np.arange(1500) / 60.0, np.random.default_rng(1), Rig()
-    glass = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(made.bands)})
-    scene = simulation.walkers(time, (16, 20), glass, rng)
+    scene = simulation.walkers(time, (16, 20), GLASS, rng)
     capture = simulation.observe(scene, made.response(), rng)
     wide = xr.concat([xr.concat([capture.isel(time=[0])] * 32, "y")] * 32, "x")
     stream = Stream(wide.drop_vars(["y", "x"], errors="ignore"), made.response(), frame_rate=60.0)

@@ -1,12 +1,12 @@
 """In situations that the paper does not assume, intervals hold, or pixels have a flag."""
 
-import warnings
 from collections.abc import Iterator
 from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
+from scenes import heard
 from scipy.interpolate import interp1d
 from worlds import RESPONSE, SHAPE, World, seen
 
@@ -84,14 +84,11 @@ LEAST, FEW, MOST_RMSE, MOST_FAR = 0.9, 0.05, 1.3, 1e-3
 def outcome(name: str, seed: int) -> tuple[float, float, float, tuple[str, ...]]:
     """Share of the intervals that hold, share and RMSE [K] of pixels without a flag, warnings."""
     capture, truth = seen(WORLDS[name][0], seed)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        if name in CLOCKS:  # as the documentation has it: on one clock, which has other times
-            before = capture["time"].values
-            capture = alignment.align(capture)
-            course = interp1d(before, truth, axis=0, fill_value="extrapolate")
-            truth = course(capture["time"].values)
-        result = separation.separate(capture, RESPONSE)
+    if name in CLOCKS:  # as the documentation has it: on one clock, which has other times
+        aligned = heard(lambda: alignment.align(capture)).result
+        course = interp1d(capture["time"].values, truth, axis=0, fill_value="extrapolate")
+        capture, truth = aligned, course(aligned["time"].values)
+    result = heard(lambda: separation.separate(capture, RESPONSE)).result
     sound = result["status"].values == 0
     error = (result["object_temperature"].values - truth)[:, sound]
     std = result["object_temperature_std"].values[:, sound]
@@ -134,9 +131,7 @@ def test_lost_frames_and_dead_pixels_spoil_nothing(name: str) -> None:
     capture["counts"].values[0][:, dead] = 60000.0
     capture["counts"][1, lost] = np.nan
     capture["status"] = ("y", "x"), np.where(dead, np.uint32(Status.DEAD_PIXEL), np.uint32(0))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        result = separation.separate(capture, RESPONSE)
+    result = heard(lambda: separation.separate(capture, RESPONSE)).result
     for film in ("object_temperature", "background_temperature"):
         lacking = result[film].isnull().values
         assert lacking[lost].all()
