@@ -1,23 +1,24 @@
 """Alignment of two cameras in time: offsets estimated and undone, lost frames left missing."""
 
+from itertools import product
 from typing import Any
 
 import numpy as np
 import pytest
 import xarray as xr
-from captures import drop_frames, still
+from captures import GLASS, RIG, drop_frames, plain_capture, still, transform_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from refused import refused
+from marks import slow
+from refused import assert_refused, refused
 from scipy.interpolate import BarycentricInterpolator
 
 from dbthermal import separation
 from dbthermal.alignment import align, exposure_times, fill_times, time_offset
-from dbthermal.simulation import Background, Rig
+from dbthermal.simulation import Background
 from reproduction.disturbances import expose
 from reproduction.experiments.cases import independent_pixels
 
-RIG = Rig()
 FRAMES, STEPS, START = 350, 20, 80
 PERIOD = 0.1
 FINE = np.arange(STEPS * (FRAMES + 10)) * PERIOD / STEPS
@@ -35,9 +36,8 @@ def glass(
     pixels: int = 400, stop: float = 333.15, seed: int = 3, **background: object
 ) -> xr.Dataset:
     """Glass that warms from 20 C, on a clock of 20 steps a frame."""
-    value = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(RIG.bands)})
     rng, moves = np.random.default_rng(seed), Background(**background)  # type: ignore[arg-type]
-    return independent_pixels(FINE, value, moves, pixels, rng, start=293.15, stop=stop)
+    return independent_pixels(FINE, GLASS, moves, pixels, rng, start=293.15, stop=stop)
 
 
 def exposed(
@@ -67,10 +67,8 @@ def ramp(bands: int = 2, frames: int = 40) -> xr.Dataset:
     """Counts that rise by 10 a second, and noise that tells the frames apart, in 16 pixels."""
     time = np.arange(frames) * PERIOD
     counts = np.broadcast_to(10.0 * time[:, np.newaxis, np.newaxis], (bands, frames, 4, 4))
-    return xr.Dataset(
-        {"counts": (("band", "time", "y", "x"), counts.astype(np.float32))},
-        coords={"band": [f"b{band}" for band in range(bands)], "time": time},
-    )
+    names = [f"b{band}" for band in range(bands)]
+    return plain_capture(counts.astype(np.float32), time, names)
 
 
 @pytest.fixture(scope="module")
@@ -108,14 +106,14 @@ def lacking(kind: str, seed: int) -> np.ndarray:
     return lost
 
 
+KINDS = ("start", "middle", "end", "several")
+LACKING = slow(*product(KINDS, (-3, -1.5, -0.75, 0, 0.3, 0.5, 1, 1.7, 3), [5]))
+LATE = slow(*zip((-2.4, -0.75, 0.3, 1.5, 3.0), ("whole", *KINDS), [(4, 5)] * 5, strict=True))
+
+
 @pytest.mark.parametrize(
     ("kind", "delay", "seed"),
-    [("start", -3, 1), ("middle", 0.5, 2), ("end", -1.7, 3), ("several", 2.25, 4)]
-    + [
-        pytest.param(kind, delay, 5, marks=pytest.mark.slow)
-        for kind in ("start", "middle", "end", "several")
-        for delay in (-3, -1.5, -0.75, 0, 0.3, 0.5, 1, 1.7, 3)
-    ],
+    [("start", -3, 1), ("middle", 0.5, 2), ("end", -1.7, 3), ("several", 2.25, 4), *LACKING],
 )
 @pytest.mark.parametrize("driver", ["nan", "stamps"])
 def test_a_block_of_frames_of_one_band(
@@ -137,8 +135,7 @@ def test_times_that_are_wrong(scene: xr.Dataset) -> None:
     capture["exposure_time"][1] += 3.0
     begin = capture["exposure_time"].values[:, 0]
     expected = rf"times begin at {begin[1]:.4g} and {begin[0]:.4g} s: .* search farther by search="
-    with pytest.raises(ValueError, match=expected):
-        align(capture)
+    assert_refused(expected, align, capture)
     found = align(capture, search=60).attrs["time_offset"][1]
     assert abs(found + 3.0) < 0.1 * PERIOD
     assert align(capture, offset=-3.0).attrs["time_offset"] == [0.0, -3.0]
@@ -173,16 +170,14 @@ def test_noise_gives_no_offset_by_chance(seed: int) -> None:
     """A capture in which nothing moves gives no offset."""
     noise = ramp(frames=100)
     noise["counts"].values[...] = np.random.default_rng(seed).normal(size=noise["counts"].shape)
-    with pytest.raises(ValueError, match=r"no rapid change that both|the end of the search"):
-        time_offset(noise)
+    assert_refused(r"no rapid change that both|the end of the search", time_offset, noise)
 
 
 @pytest.mark.parametrize(
     ("stop", "delay"),
-    [(318.15, 0.5), (333.15, 1.7), (318.15, 3)]
-    + [
-        pytest.param(stop, delay, marks=pytest.mark.slow)
-        for stop, delay in [(318.15, 0.3), (318.15, 1.7), (333.15, 0.5), (333.15, 1), (333.15, 3)]
+    [
+        *((318.15, 0.5), (333.15, 1.7), (318.15, 3)),
+        *slow((318.15, 0.3), (318.15, 1.7), (333.15, 0.5), (333.15, 1), (333.15, 3)),
     ],
 )
 def test_offset_is_undone(stop: float, delay: float) -> None:
@@ -197,18 +192,7 @@ def test_offset_is_undone(stop: float, delay: float) -> None:
     assert values[1] < 1.2 * values[0]
 
 
-@pytest.mark.parametrize(
-    ("delay", "kind", "seeds"),
-    [(0.5, "middle", (3, 4))]
-    + [
-        pytest.param(delay, kind, (4, 5), marks=pytest.mark.slow)
-        for delay, kind in zip(
-            (-2.4, -0.75, 0.3, 1.5, 3.0),
-            ("whole", "start", "middle", "end", "several"),
-            strict=True,
-        )
-    ],
-)
+@pytest.mark.parametrize(("delay", "kind", "seeds"), [(0.5, "middle", (3, 4)), *LATE])
 def test_intervals_hold_after_an_alignment(delay: float, kind: str, seeds: tuple[int, ...]) -> None:
     """95 % intervals hold in 93 to 97 %, of interpolated frames and where a band lacks a block."""
     scores = []
@@ -242,9 +226,7 @@ def test_noise_factor_is_that_of_the_interpolation() -> None:
 def test_noise_factor_of_a_warp() -> None:
     """Interpolation over pixels lessens noise and residual pattern of the warped band alone."""
     capture = still(level=0.0, count=100, noise=1.0).assign(pattern_std=("band", [3.0, 3.0]))
-    matrices = np.stack([np.eye(3)] * 2)
-    matrices[1, :2, 2] = 0.5, 0.25  # [pixel]
-    transform = xr.DataArray(matrices, {"band": capture["band"]}, ("band", "row", "column"))
+    transform = transform_of([[1.0, 0.0, 0.5], [0.0, 1.0, 0.25], [0.0, 0.0, 1.0]])  # [pixel]
     aligned = align(capture, offset=0.0, transform=transform)
     factor = aligned["noise_factor"].values
     # Lines between pixels and, where there are six pixels either way, polynomials through these.

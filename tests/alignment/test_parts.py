@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
+from captures import plain_capture
 from scipy.special import expit
 
 from dbthermal import alignment, schema
@@ -25,8 +26,7 @@ def clocks_tried(
     """
     bands, tried = ["8-14", "9.5", "more"][: len(start)], list[float]()
     together = xr.DataArray(np.zeros(len(bands)), {"band": bands}, "band")
-    counts = ("band", "time", "y", "x"), np.zeros((len(bands), 40, 1, 1), np.float32)
-    small = xr.Dataset({"counts": counts}, {"band": bands, "time": FRAME * np.arange(40)})
+    small = plain_capture(np.zeros((len(bands), 40, 1, 1), np.float32), bands=bands)
 
     def resample(_: xr.Dataset, offset: xr.DataArray | None = None, **__: Any) -> xr.Dataset:
         own = FRAME * np.array(start) if offset is None else offset.values
@@ -85,10 +85,7 @@ def test_a_square_without_some_samples_is_still(monkeypatch: pytest.MonkeyPatch)
     counts[0, :, 0:3, 3:6] = np.nan  # a square that one band does not see
     status = np.zeros((6, 9), np.uint32)
     status[4, 4], counts[:, :, 4, 4] = schema.Status.DEAD_PIXEL, 7.0
-    corrected = xr.Dataset(
-        {"counts": (("band", "time", "y", "x"), counts), "status": (("y", "x"), status)},
-        {"band": ["8-14", "9.5"], "time": np.arange(40) / 10.0},
-    )
+    corrected = plain_capture(counts, status=(("y", "x"), status))
     monkeypatch.setattr(joint, "_PIXELS", 6)
     small = joint._of_squares(corrected)
     values, blind = small["counts"].values, np.zeros((2, 3), dtype=bool)
@@ -112,8 +109,7 @@ def test_rapid_changes_keep_their_size_between_frames(clock: str) -> None:
         pulse = expit((time - start) / 0.2) - expit((time - start - 3.0) / 0.2)
         film += rng.uniform(5.0, 15.0, 1024) * pulse * [[[1.0]], [[4.0]]]
     film += rng.standard_normal(film.shape) * [[[2.0]], [[20.0]]]
-    counts = ("band", "time", "y", "x"), film.reshape(2, 300, 32, 32)
-    capture = xr.Dataset({"counts": counts}, {"band": ["8-14", "9.5"], "time": time[0, :, 0]})
+    capture = plain_capture(film.reshape(2, 300, 32, 32), time[0, :, 0])
     aligned = alignment.align(capture, offset=0.5, clock=clock)
     values, noise = aligned["counts"].values.reshape(2, -1), aligned["noise_factor"] * [2.0, 20.0]
     (first, product), (_, second) = np.cov(values[:, np.isfinite(values).all(axis=0)])

@@ -6,13 +6,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import xarray as xr
+from captures import RIG, plain_capture
 
 from dbthermal import alignment
-from dbthermal.simulation import Rig
 
 Floats = npt.NDArray[np.float64]
 
-RIG = Rig()
 FRAMES = 300
 EVEN = np.arange(FRAMES) / 10.0  # s
 PAUSED = EVEN + 3600.0 * (EVEN >= 12.0)
@@ -38,11 +37,7 @@ def filmed(stamps: Floats, real: Floats | None = None, pixels: int = 256) -> xr.
             counts[band, :, pixel] = (1.0 - share) * slow + share * 4.0 * gone
         counts[band] += rng.normal(0.0, noise, counts[band].shape)
     image = (16000.0 + 115.0 * counts).reshape(2, -1, 16, pixels // 16).astype(np.float32)
-    films = {"counts": (("band", "time", "y", "x"), image)}
-    return xr.Dataset(
-        films | {"exposure_time": (("band", "time"), stamps)},
-        {"band": list(RIG.bands), "time": stamps[0]},
-    )
+    return plain_capture(image, stamps[0], exposure_time=(("band", "time"), stamps))
 
 
 @pytest.mark.parametrize("late", [-0.27, -0.1, 0.05, 0.13])

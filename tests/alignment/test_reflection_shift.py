@@ -1,13 +1,15 @@
 """Shift of the reflections between two cameras side by side, against simulated truth."""
 
-import warnings
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray as xr
-from refused import refused
+from captures import GLASS, RIG, plain_capture
+from marks import long, slow
+from refused import assert_refused, refused
+from scenes import heard, painted
 from scipy.ndimage import gaussian_filter
 from worlds import RESPONSE as WORLD
 from worlds import World, seen
@@ -18,12 +20,9 @@ from reproduction.experiments.pictures import Picture, smooth_shift
 from reproduction.experiments.twins import capture_of
 from reproduction.twins import stage
 
-RIG = simulation.Rig()
 RESPONSE = RIG.response()
 QUIET = simulation.Rig(noise=(0.03, 0.08)).response()
-GLASS = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(RIG.bands)})
-LONG = [pytest.param(one, marks=pytest.mark.long) for one in ((0.7, 0.0), (6.0, 2.0))]
-SHIFTS = [*(pytest.param(one, marks=pytest.mark.slow) for one in ((0.0, 0.0), (2.4, 1.2))), *LONG]
+SHIFTS = [*slow(((0.0, 0.0),), ((2.4, 1.2),)), *long(((0.7, 0.0),), ((6.0, 2.0),))]
 
 
 def drawn(
@@ -34,10 +33,9 @@ def drawn(
     emissivity: xr.DataArray = GLASS,
 ) -> tuple[xr.Dataset, np.ndarray]:
     """Capture of people mirrored, by default in glass, and the true shift (2, y, x) [pixel]."""
-    picture, rng = picture or Picture(), np.random.default_rng(seed)
+    picture = picture or Picture()
     true = smooth_shift(picture.shape, *shift)
-    scene = picture.draw(np.arange(frames) / 10.0, emissivity, rng, true)
-    return simulation.observe(scene, RESPONSE, rng), true
+    return painted(seed, emissivity, picture, true, time=np.arange(frames) / 10.0).capture, true
 
 
 def errors(field: xr.Dataset, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -141,11 +139,9 @@ def test_an_object_that_fills_a_third_of_the_image() -> None:
 
 def test_deviation_of_a_field_finer_than_its_grid() -> None:
     """Where windows ask for other shifts than a smooth field can have, its deviation is larger."""
-    rng, picture = np.random.default_rng(62), Picture(shape=(48, 64))
-    true = smooth_shift(picture.shape, 2.4, 1.2)
+    picture, true = Picture(shape=(48, 64)), smooth_shift((48, 64), 2.4, 1.2)
     true[1] += np.sin(2.0 * np.pi * np.arange(48) / 9.0)[:, np.newaxis]
-    scene = picture.draw(np.arange(200) / 10.0, GLASS, rng, true)
-    capture = simulation.observe(scene, RESPONSE, rng)
+    capture = painted(62, GLASS, picture, true, time=np.arange(200) / 10.0).capture
     _, score = errors(alignment.reflection_shift(capture, RESPONSE), true)
     assert np.sqrt(np.mean(score[1] ** 2)) < 10.0
 
@@ -219,13 +215,7 @@ def test_touches_are_no_reflections(seed: int) -> None:
     assert abs(late) < 0.012
 
 
-@pytest.mark.parametrize(
-    "seed",
-    [
-        pytest.param(2, marks=pytest.mark.slow),
-        *(pytest.param(one, marks=pytest.mark.long) for one in (11, 17)),
-    ],
-)
+@pytest.mark.parametrize("seed", [*slow(2), *long(11, 17)])
 def test_reflections_that_mostly_change_slowly(seed: int) -> None:
     """In a simulated twin of the wineglass the fastest changes tell little, and lead nobody astray.
 
@@ -255,15 +245,7 @@ def test_large_field() -> None:
     assert np.median(np.abs(error[1])) < 0.05
 
 
-STILL = xr.Dataset(
-    {
-        "counts": (
-            ("band", "time", "y", "x"),
-            np.random.default_rng(1).normal(2e4, 4.0, (2, 60, 30, 32)),
-        )
-    },
-    {"band": list(RIG.bands), "time": np.arange(60) / 10.0},
-).astype(np.float32)
+STILL = plain_capture(np.random.default_rng(1).normal(2e4, 4.0, (2, 60, 30, 32)).astype(np.float32))
 DEAD = xr.DataArray(np.full((30, 32), schema.Status.DEAD_PIXEL, np.uint32), dims=("y", "x"))
 DEAD.attrs.update(schema.Status.cf_attrs(schema.STATUS))
 
@@ -284,8 +266,7 @@ test_refuses_what_tells_no_shift = refused(
 def test_refuses_a_shift_beyond_a_third_of_the_image() -> None:
     """What matches at the end of the search is no shift."""
     capture, _ = drawn(46, (22.0, 0.0), Picture(shape=(40, 48)), frames=150)
-    with pytest.raises(ValueError, match="less than a third of the image"):
-        alignment.reflection_shift(capture, RESPONSE)
+    assert_refused("less than a third of the image", alignment.reflection_shift, capture, RESPONSE)
 
 
 def lamp(
@@ -372,7 +353,5 @@ def test_coloured_clouds_are_not_displaced(colour: float) -> None:
     capture = simulation.observe(scene, RESPONSE, rng)
     field = alignment.reflection_shift(capture, RESPONSE)
     assert np.median(np.abs(errors(field, np.zeros((2, 48, 64)))[1]), axis=1).max() < 3.0
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        result = separation.separate(capture, RESPONSE)
+    result = heard(lambda: separation.separate(capture, RESPONSE)).result
     assert result.attrs["reflection_shift"] == "none"

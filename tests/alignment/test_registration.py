@@ -5,15 +5,14 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
-from captures import emissivity_of
+from captures import GLASS, RIG, people, plain_capture, transform_of
+from refused import assert_refused
 
 from dbthermal import alignment, schema, simulation
 from dbthermal.correction import correct_capture
-from dbthermal.simulation import Rig
 from reproduction import disturbances
 from reproduction.experiments import whole
 
-RIG = Rig()
 SHAPE = (96, 128)
 
 
@@ -47,13 +46,6 @@ def homography(shift: tuple[float, float], degrees: float, scale: float) -> np.n
     return matrix
 
 
-def transform_of(matrix: np.ndarray) -> xr.DataArray:
-    """Transform that moves the second view alone."""
-    return xr.DataArray(
-        np.stack([np.eye(3), matrix]), {"band": list(RIG.bands)}, ("band", "row", "column")
-    )
-
-
 def views(matrix: np.ndarray, seed: int = 0, frames: int = 3) -> xr.Dataset:
     """Two views of one plane, the second of other gain, offset and noise, with bad pixels."""
     rng = np.random.default_rng(seed)
@@ -64,13 +56,8 @@ def views(matrix: np.ndarray, seed: int = 0, frames: int = 3) -> xr.Dataset:
     counts[1, :, 20, 30], counts[1, :, 50, 77] = 0.0, 60000.0
     status = np.zeros(SHAPE, dtype=np.uint16)
     status[20, 30] = status[50, 77] = schema.Status.DEAD_PIXEL
-    return xr.Dataset(
-        {
-            "counts": (("band", "time", "y", "x"), counts.astype(np.float32)),
-            "status": (("y", "x"), status, schema.Status.cf_attrs(schema.STATUS)),
-        },
-        coords={"band": ["8-14", "9.5"], "time": np.arange(frames) / 10.0},
-    )
+    bad = ("y", "x"), status, schema.Status.cf_attrs(schema.STATUS)
+    return plain_capture(counts.astype(np.float32), status=bad)
 
 
 @pytest.mark.parametrize("model", ["affine", "homography"])
@@ -96,8 +83,7 @@ def test_a_warm_spot_tells_the_translation_alone(shape: tuple[int, int]) -> None
     errors, noise = [], RIG.response()["noise"].values.reshape(2, 1, 1, 1)
     for seed in range(3):
         rng = np.random.default_rng(seed)
-        scene = simulation.walkers(np.arange(200) / 10.0, shape, emissivity_of(0.86, 0.72), rng)
-        capture = simulation.observe(scene, RIG.response(), rng)
+        _, capture = people(rng, 200, shape)
         # A blackbody of four steps of 16 frames leaves an eighth of the noise of a frame.
         pattern = rng.normal(0, 0.125, (2, 1, *shape)) * noise
         capture["counts"] = capture["counts"] + pattern.astype(np.float32)
@@ -177,8 +163,7 @@ def test_views_that_do_not_match(second: Any, model: Any, message: str) -> None:
     if second is not None:
         capture["counts"].values[1] = second
     capture["counts"].values[1, 1:] += np.array([[[1.0]], [[2.0]]], dtype=np.float32)
-    with pytest.raises(ValueError, match=message):
-        alignment.register(capture, model=model)
+    assert_refused(message, alignment.register, capture, model=model)
 
 
 def test_views_that_share_little_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -186,14 +171,13 @@ def test_views_that_share_little_are_refused(monkeypatch: pytest.MonkeyPatch) ->
     apart = np.eye(3)
     apart[0, 2] = 0.6 * SHAPE[1]
     monkeypatch.setattr("dbthermal.alignment._registration._start", lambda *_: (0.99, apart))
-    with pytest.raises(ValueError, match=r"band '9\.5': it shares 40% of the image"):
-        alignment.register(views(np.eye(3)))
+    assert_refused(r"band '9\.5': it shares 40% of the image", alignment.register, views(np.eye(3)))
 
 
 def test_the_offset_is_that_of_registered_views() -> None:
     """The offset of views 3 pixels and 4/3 frames apart is found after their registration."""
     fine, rng, response = np.arange(606) / 30.0, np.random.default_rng(3), RIG.response()
-    wide = simulation.walkers(fine, (32, 40), emissivity_of(0.86, 0.72), rng)
+    wide = simulation.walkers(fine, (32, 40), GLASS, rng)
     seen = [wide.isel(y=slice(4, 28), x=slice(4, 36)), wide.isel(y=slice(2, 26), x=slice(7, 39))]
     parts = [
         disturbances.expose(
