@@ -23,6 +23,7 @@ import pytest
 import tifffile
 import xarray as xr
 import zarr
+from captures import GLASS, emissivity_of
 from PIL import Image
 
 from dbthermal import __main__ as command_line
@@ -82,8 +83,7 @@ def refused(folder: Path, *arguments: str) -> str:
 def scene() -> Scene:
     """Truth of a plate of glass, its raw counts, and those of a blackbody."""
     rig, rng, shape = simulation.Rig(), np.random.default_rng(1), (24, 32)
-    glass = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(rig.bands)})
-    truth = simulation.walkers(np.arange(FRAMES) / 10, shape, glass, rng)
+    truth = simulation.walkers(np.arange(FRAMES) / 10, shape, GLASS, rng)
     detector = simulation.pattern(rig, shape, rng)
     kelvin = np.array([278.15, 298.15, 318.15, 343.15])
     movies = simulation.blackbody_movies(rig, kelvin, 16, detector, rng)
@@ -135,7 +135,7 @@ def test_three_bands(tmp_path: Path) -> None:
     """Three cameras, with the offset of each, go the whole way; a wrong number of offsets not."""
     bands, rng, shape = ("8-14", "9.5", "10.6"), np.random.default_rng(1), (8, 10)
     rig = simulation.Rig(bands=bands, noise=(0.03, 0.3, 0.3), bad_fraction=0.0)
-    glass = xr.DataArray([0.86, 0.72, 0.82], dims="band", coords={"band": list(bands)})
+    glass = emissivity_of(0.86, 0.72, 0.82, bands=bands)
     truth = simulation.walkers(np.arange(FRAMES) / 10, shape, glass, rng)
     detector = simulation.pattern(rig, shape, rng)
     raw = simulation.capture(simulation.observe(truth, rig.response(), rng), detector)

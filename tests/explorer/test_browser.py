@@ -20,7 +20,7 @@ import nbformat
 import numpy as np
 import pytest
 import xarray as xr
-from captures import emissivity_of
+from captures import FILMS, GLASS, RIG, people
 from PIL import Image
 
 from dbthermal import separation, simulation, store
@@ -274,9 +274,7 @@ def check_narrow(page: Any) -> None:
 
 def test_region_is_dragged_and_its_curve_read_back(lab: Lab, page: Any) -> None:
     """Curves of a drawn and a moved region are the view's; keys step; no request goes outside."""
-    response, rng = simulation.Rig().response(), np.random.default_rng(4)
-    scene = simulation.walkers(np.arange(120) / 10, (24, 32), emissivity_of(0.86, 0.72), rng)
-    capture = simulation.observe(scene, response, rng)
+    response, (_, capture) = RIG.response(), people(4, 120, (24, 32))
     result = separation.solve(capture, response)
     parts = {"result.zarr": result, "capture.zarr": capture, "response.zarr": response}
     for name, part in parts.items():
@@ -318,13 +316,12 @@ def large_store(folder: Path, shape: tuple[int, int, int]) -> None:
     rng, response = np.random.default_rng(2), simulation.Rig().response()
     time, columns = np.arange(frames) / 30, np.linspace(0, 20, width)
     film = 295 + np.linspace(0, 10, frames)[:, None, None] + columns + np.zeros((1, 16, 1))
-    names = ("object_temperature", "background_temperature")
-    maps = emissivity_of(0.86, 0.72).expand_dims(y=16, x=width).transpose("band", "y", "x")
+    maps = GLASS.expand_dims(y=16, x=width).transpose("band", "y", "x")
 
     def results() -> Iterator[xr.Dataset]:
         for _ in range(0, height, 16):
             noisy = (film + rng.normal(0, 0.1, film.shape)).astype(np.float32)
-            films = dict.fromkeys(names, noisy) | {f"{name}_std": noisy / 3000 for name in names}
+            films = dict.fromkeys(FILMS, noisy) | {f"{name}_std": noisy / 3000 for name in FILMS}
             arrays = {name: (("time", "y", "x"), one) for name, one in films.items()}
             status = ("y", "x"), np.zeros((16, width), np.uint32)
             yield xr.Dataset({**arrays, "status": status}, {"time": time}).assign(emissivity=maps)

@@ -10,11 +10,11 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import xarray as xr
-from captures import emissivity_of, still
+from captures import RIG, people, still
 from hypothesis import example, given
 from hypothesis import strategies as st
 from PIL import Image
-from refused import refused
+from refused import assert_raises, refused
 
 import dbthermal
 from dbthermal import schema, store
@@ -115,13 +115,11 @@ def test_deviation_that_is_shared_does_not_shrink(name: str, changes: dict[str, 
 @pytest.mark.parametrize("pooled", [False, True], ids=["alone", "pooled"])
 def test_mean_of_a_region_is_as_certain_as_stated(pooled: bool) -> None:
     """95 % intervals of means of 12 to 140 pixels hold in 90 to 99 %, materials pooled or not."""
-    rig, scores, glass = dbthermal.simulation.Rig(), [], emissivity_of(0.86, 0.72)
+    response, scores = RIG.response(), []
     separate = dbthermal.separation.separate if pooled else dbthermal.separation.solve
     for seed in range(16):
-        rng = np.random.default_rng(seed)
-        scene = dbthermal.simulation.walkers(np.arange(150) / 10, (12, 16), glass, rng)
-        capture = dbthermal.simulation.observe(scene, rig.response(), rng)
-        view = View(separate(capture, rig.response()))
+        scene, capture = people(seed, 150, (12, 16))
+        view = View(separate(capture, response))
         for corners in (((1, 1), (11, 15)), ((4, 4), (7, 8)), ((2, 2), (9, 10))):
             region = Region("rectangle", corners)
             curve = view.curve("object_temperature", region)
@@ -338,8 +336,7 @@ def test_without_the_extra_its_name_is_told(monkeypatch: pytest.MonkeyPatch) -> 
     """One line says what to install."""
     monkeypatch.delitem(sys.modules, "dbthermal.explorer._widget", raising=False)
     monkeypatch.setitem(sys.modules, "anywidget", None)
-    with pytest.raises(ImportError, match=r"pip install '\.\[explorer\]'"):
-        dbthermal.explore(separated())
+    assert_raises(ImportError, r"pip install '\.\[explorer\]'", dbthermal.explore, separated())
 
 
 def test_no_room_for_a_film_is_an_error(
