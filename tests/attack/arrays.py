@@ -18,7 +18,7 @@ from reproduction import methods
 from reproduction.methods.bcp import BcpSettings
 from reproduction.methods.dbvt import DbvtSettings
 
-_FAST: Final[Mapping[str, Any]] = {
+FAST: Final[Mapping[str, Any]] = {
     "dbvt": DbvtSettings(stages=2, stage_steps=2, steps=4),
     "bcp": BcpSettings(patch=3, window=5),
 }
@@ -83,7 +83,7 @@ def solving(
 ) -> Attack:
     """Attack by one call of `solve`, with quick settings and what the method needs."""
     used = response_of(made) if response is None else response
-    more.setdefault("settings", _FAST.get(method))
+    more.setdefault("settings", FAST.get(method))
     if method == "calibrated":
         more.setdefault("emissivity", made.known.isel(y=0, x=0, drop=True))
     act = lambda: separation.solve(made.capture, used, methods.get_method(method), **more)  # noqa: E731

@@ -5,7 +5,7 @@ from itertools import product
 import numpy as np
 import pytest
 import xarray as xr
-from captures import emissivity_of
+from captures import GLASS, RIG, emissivity_of
 from numpy.testing import assert_allclose
 
 from dbthermal import separation, simulation
@@ -15,8 +15,6 @@ from dbthermal.separation._solve import get_method, separated
 from reproduction.experiments.pictures import Picture
 
 TIME = np.arange(300) / 10.0
-GLASS = emissivity_of(0.86, 0.72)
-RIG = simulation.Rig()
 FOUR = simulation.Rig(bands=("8-14", "9.5", "10.6", "12.1"), noise=(0.03, 0.35, 0.15, 0.2))
 RISES = {"6-20 s": (6.0, 20.0), "2-6 s": (2.0, 6.0), "0.5-2 s": (0.5, 2.0)}
 
