@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
-import xarray as xr
+from captures import RIG, people
 from hostile_files import seed_of_week
+from marks import slow
 
-from dbthermal import simulation, store
+from dbthermal import store
 
 COMMANDS = {
     "import": "import a.tif b.tif --bands wide narrow --unit count --clock 10 --offset 0 -o x.zarr",
@@ -49,14 +50,12 @@ sys.exit(main(sys.argv[3:]))
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Files and stores of bands that no library knows."""
-    folder, rig, rng = tmp_path_factory.mktemp("user"), simulation.Rig(), np.random.default_rng(1)
-    glass = xr.DataArray([0.86, 0.72], dims="band", coords={"band": list(rig.bands)})
-    scene = simulation.walkers(np.arange(64) / 10, (8, 12), glass, rng)
-    capture = simulation.observe(scene, rig.response(), rng).assign_coords(band=["wide", "narrow"])
+    folder, (_, capture) = tmp_path_factory.mktemp("user"), people(1, 64, (8, 12))
+    capture = capture.assign_coords(band=["wide", "narrow"])
     store.save(capture, folder / "scene.zarr", {})
     raw = capture[["counts"]].round().astype("uint16", keep_attrs=True)
     store.save(raw, folder / "raw.zarr", {})
-    store.save(rig.response().assign_coords(band=["wide", "narrow"]), folder / "response.zarr", {})
+    store.save(RIG.response().assign_coords(band=["wide", "narrow"]), folder / "response.zarr", {})
     for name, counts in zip("ab", capture["counts"].values, strict=True):
         tifffile.imwrite(folder / f"{name}.tif", counts.astype("uint16"), photometric="minisblack")
     status, error = end(start(folder, "separate", output="result.zarr"))
@@ -98,7 +97,7 @@ def clean(folder: Path) -> None:
 
 
 QUICK = ["import", "export"]
-SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in COMMANDS if name not in QUICK]
+SLOW = slow(*(name for name in COMMANDS if name not in QUICK))
 
 
 @pytest.mark.parametrize("command", [*QUICK, *SLOW])
@@ -136,12 +135,7 @@ def test_signals_leave_nothing(folder: Path, command: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("command", "second"),
-    [
-        ("import", "import"),
-        ("run", "run"),
-        *[pytest.param("run", "correct", marks=pytest.mark.slow)],
-    ],
+    ("command", "second"), [("import", "import"), ("run", "run"), *slow(("run", "correct"))]
 )
 def test_two_commands_at_one_output(folder: Path, command: str, second: str) -> None:
     """The second is told the process of the first, which ends well."""
