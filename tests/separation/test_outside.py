@@ -11,7 +11,8 @@ from typing import Final
 import numpy as np
 import pytest
 import xarray as xr
-from attack.scenes import SLOPE, Array, counts_of
+from attack.scenes import SLOPE, Array, blackbody, counts_of
+from captures import plain_capture
 from scenes import held
 
 from dbthermal import calibration, separation
@@ -115,16 +116,11 @@ def draw(name: str, seed: int, louder: float = 1.0) -> tuple[xr.Dataset, xr.Data
     dims = ("time", "y", "x")
     values = {"object_temperature": (dims, warm), "background_temperature": (dims, cold)}
     truth = xr.Dataset(values | {"emissivity": (("band", "y", "x"), pair)}, {"band": bands})
-    coordinates = {"band": bands, "time": ("time", time, {"units": "s"})}
-    capture = xr.Dataset(
-        {"counts": (("band", *dims), counts.astype(np.float32), {"units": "count"})}, coordinates
-    )
-    temperature, units = np.linspace(250.0, HIGHEST, 14), {"units": "count"}
-    seen = [counts_of(band, temperature) for band in bands] + rng.normal(0, 0.1, (count, 14))
-    label = {"band": bands, "temperature": temperature}
-    blackbody = xr.DataArray(seen, label, ("band", "temperature"), attrs=units)
-    stds = xr.DataArray(noise, {"band": bands}, ("band",), attrs=units)
-    return truth, capture, calibration.fit_response(blackbody, None, **EXACT).assign(noise=stds)
+    capture = plain_capture(counts.astype(np.float32), ("time", time, {"units": "s"}), bands)
+    sweep = blackbody(BANDS[:count], np.linspace(250.0, HIGHEST, 14))
+    sweep.values += rng.normal(0, 0.1, sweep.shape)
+    stds = xr.DataArray(noise, {"band": bands}, ("band",), attrs={"units": "count"})
+    return truth, capture, calibration.fit_response(sweep, None, **EXACT).assign(noise=stds)
 
 
 @pytest.mark.parametrize(
