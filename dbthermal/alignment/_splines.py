@@ -11,19 +11,18 @@ one body to the next: differences follow Student's distribution, not a normal on
 """
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any, Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 from scipy.interpolate import BSpline
-from scipy.linalg import block_diag, cho_solve_banded, cholesky_banded
+from scipy.linalg import block_diag, cho_solve, cholesky
 from scipy.ndimage import gaussian_filter
 
 from dbthermal._arrays import Array
 from dbthermal._compiled import compiled
-from dbthermal._smooth import Whole
 
 Movie = npt.NDArray[np.float32]
 Image = TypeVar("Image", bound=npt.NDArray[Any])
@@ -49,11 +48,7 @@ def binned(image: npt.NDArray[Any], factor: int) -> npt.NDArray[Any]:
 
 def blurred(image: Image, width: float) -> Image:
     """Image (y, x, plane) blurred by a Gaussian of a width [pixel], mirrored at the border."""
-    impulse = np.zeros(2 * int(4.0 * width + 0.5) + 1)
-    impulse[impulse.size // 2] = 1.0
-    weights = gaussian_filter(impulse, width).astype(image.dtype)
-    lines = np.ascontiguousarray(image).reshape(1, len(image), -1)
-    result: Image = _blurred(_blurred(lines, weights).reshape(image.shape), weights)
+    result: Image = gaussian_filter(image, width, axes=(0, 1))
     return result
 
 
@@ -114,23 +109,6 @@ def normal_equations(sums: Array, noise: Array) -> Array:
     tensor = ratio**2 * (full[..., 1:4, 1:4] - cross.mT * cross / size)
     force = ratio * (full[..., 4:, 1:4] - ratio * cross)
     return np.concatenate([tensor, force], axis=-2)
-
-
-@compiled
-def _blurred(movie: Any, weights: Any) -> Any:
-    """Image (line, place, plane) with weighted means over the places of each line."""
-    lines, size, planes = movie.shape
-    reach, result = weights.size // 2, np.zeros_like(movie)
-    for line, place in np.ndindex(lines, size):
-        out = result[line, place]
-        for i in range(weights.size):
-            # A place beyond an end is mirrored, as often as needed.
-            near = (place + i - reach) % (2 * size)
-            source = movie[line, min(near, 2 * size - 1 - near)]
-            weight = weights[i]
-            for t in range(planes):
-                out[t] += weight * source[t]
-    return result
 
 
 @compiled
@@ -235,32 +213,13 @@ class Spline:
         level += np.kron(row, right.T @ right) / width**2
         return np.asarray(np.eye(len(level)) / self.prior**2 + level / _SLOPE**2)
 
-    @cached_property
-    def _order(self) -> Whole:
-        """Order of the nodes' numbers, those of near nodes near: so that matrices have a band."""
-        return np.arange(2 * len(self.before)).reshape(2, *self.nodes).transpose(2, 1, 0).ravel()
-
-    @cached_property
-    def _band(self) -> tuple[Whole, Whole]:
-        """Rows and columns of a matrix of the nodes that are its band below the diagonal."""
-        last = self._order.size - 1
-        below, column = np.indices((6 * self.nodes[0] + 8, last + 1))
-        return self._order[np.minimum(column + below, last)], self._order[column]
-
-    def factored(self, matrix: Array) -> Array:
-        """Cholesky factor of a matrix of the nodes, its band."""
-        return np.asarray(cholesky_banded(matrix[self._band], lower=True, check_finite=False))
-
-    def solved(self, factor: Array, right: Array) -> Array:
-        """Nodes of a factored matrix and a right side."""
-        result, ordered = np.empty_like(right), right[self._order]
-        result[self._order] = cho_solve_banded((factor, True), ordered, check_finite=False)
-        return result
-
     def values(self, centres: list[Array]) -> list[Array]:
         """Splines (place, node) at rows and at columns."""
-        places = (place.tobytes() for place in centres)
-        return [_splines(*side) for side in zip(places, self.shape, self.nodes, strict=True)]
+        values = []
+        for places, size, count in zip(centres, self.shape, self.nodes, strict=True):
+            knots, inner = np.arange(count + 4) - 3.0, places / (size - 1) * (count - 3)
+            values.append(BSpline.design_matrix(inner, knots, 3).toarray())
+        return values
 
     def fitted(
         self, data: Information, centres: list[Array], guess: "Field | None" = None
@@ -280,10 +239,11 @@ class Spline:
         for trial in trials:
             # log p = (log |lambda P + R| - log |A + lambda P + R| + target' c) / 2
             before = block_diag(*(trial * blocks + self.before))
-            trial_factor = self.factored(matrix + before)
-            trial_nodes, likelihood = self.solved(trial_factor, target), np.inf
+            trial_factor = cholesky(matrix + before, lower=True)
+            trial_nodes, likelihood = cho_solve((trial_factor, True), target), np.inf
             if trials.size > 1:
-                logs = [np.log(array[0]).sum() for array in (self.factored(before), trial_factor)]
+                factors = cholesky(before, lower=True), trial_factor
+                logs = [np.log(np.diagonal(array)).sum() for array in factors]
                 likelihood = 2.0 * (logs[0] - logs[1]) + target @ trial_nodes
             if likelihood > best:
                 best, penalty, factor, nodes = likelihood, trial, trial_factor, trial_nodes
@@ -314,18 +274,10 @@ class Field:
         """Variance (2, y, x) of the displacement at each place [pixel^2]."""
         rows, columns = (_pairs(pair) for pair in self.spline.values(centres))
         height, width = self.spline.nodes
-        covariance = self.spline.solved(self.factor, np.eye(self.nodes.size))
+        covariance = cho_solve((self.factor, True), np.eye(self.nodes.size))
         blocks = covariance.reshape(2, height, width, 2, height, width)
         planes = [blocks[axis, :, :, axis].transpose(0, 2, 1, 3) for axis in (0, 1)]
         return np.stack([rows @ it.reshape(height**2, width**2) @ columns.T for it in planes])
-
-
-@lru_cache(maxsize=16)  # of the levels from coarse to fine
-def _splines(places: bytes, size: int, count: int) -> Array:
-    """Splines (place, node) along a side of so many pixels and nodes."""
-    knots, inner = np.arange(count + 4) - 3.0, np.frombuffer(places) / (size - 1) * (count - 3)
-    result: Array = BSpline.design_matrix(inner, knots, 3).toarray()
-    return result
 
 
 def _pairs(values: Array) -> Array:
