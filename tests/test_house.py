@@ -12,7 +12,7 @@ HOUSE = Path(dbthermal.__file__).parent
 BUDGET = {
     "": (3475, 15),
     "_cli": (1251, 5),
-    "alignment": (2800, 10),
+    "alignment": (2799, 10),
     "calibration": (738, 2),
     "correction": (1704, 5),
     "emissivity": (402, 1),
@@ -26,7 +26,7 @@ BUDGET = {
     "simulation": (523, 1),
     "store": (1356, 6),
 }
-INSTALLED = 35_816  # lines of all rooms
+INSTALLED = 35_815  # lines of all rooms
 
 PRONOUNS = {
     *("one", "other", "others", "own", "part", "parts", "some", "here", "there", "told", "known"),

@@ -297,8 +297,7 @@ def _common(shared: _Pair, names: list[str]) -> Mask:
 
 def _rapid(movie: Array, times: Array, valid: Mask, segment: smooth.Whole) -> Array:
     """Residual of a signal (time, pixel) on smooth functions and steps; 0 in invalid frames."""
-    steps = segment[valid][:, np.newaxis] == np.unique(segment[valid])[1:]
-    functions, _ = np.linalg.qr(np.hstack([smooth.polynomial_basis(times[valid], _ORDER), steps]))
+    functions = smooth.subspace(times[valid], _ORDER, segment=segment[valid]).functions
     residual = np.zeros_like(movie)
     residual[valid] = movie[valid] - functions @ (functions.T @ movie[valid])
     return residual
