@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hostile_files import seed_of_week
+from marks import long
 
 from attack import oracle
 from attack.containers import BOMBS, FALSE, TRUE, container
@@ -17,7 +18,7 @@ from attack.oracle import Attack, Verdict, carry_out
 from attack.runner import CLASSES, Worker, attack_all, bad, table
 
 SHORT, WEEKLY, LONG = 200, 1500, 6000
-"""Inputs of the quick tests, of the slow ones, which are others every week, and of the long one."""
+"""Inputs of the quick tests, and of the long ones, of which some are others every week."""
 
 
 @pytest.fixture(scope="module")
@@ -46,10 +47,8 @@ def test_each_container(name: str) -> None:
 
 @pytest.mark.parametrize(
     ("number", "seed"),
-    [
-        pytest.param(WEEKLY, 1000 * seed_of_week(), marks=pytest.mark.slow, id="of this week"),
-        pytest.param(LONG, 1001, marks=pytest.mark.long, id="long"),
-    ],
+    long((WEEKLY, 1000 * seed_of_week()), (LONG, 1001)),
+    ids=["of this week", "long"],
 )
 def test_many_attacks(number: int, seed: int) -> None:
     """99 % of the inputs end well, and of the pixels without a flag at most 0.1 % are wrong.

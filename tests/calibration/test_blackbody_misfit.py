@@ -112,7 +112,7 @@ def test_good_sweeps_pass(noise: float | None) -> None:
     assert false_alarms(range(40), noise) == []
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_good_sweeps_pass_in_all_but_one_of_a_thousand() -> None:
     """At most 0.1 % of good sweeps are refused."""
     noises = (None, 0.03, 0.35, 1.0)

@@ -14,7 +14,7 @@ import pytest
 import xarray as xr
 from faulty_camera import BANDS, two_bands, two_cameras
 from file_operations import before_operation, operations_of
-from marks import slow
+from marks import long
 from rig_session import LIMIT
 from test_capture_file import CaptureFile, Note, begun, shot
 
@@ -93,7 +93,7 @@ def check_written(opened: xr.Dataset) -> list[int]:
     return written
 
 
-@pytest.mark.parametrize("share", [*MOMENTS, *slow(*np.linspace(0.1, 1, 19))])
+@pytest.mark.parametrize("share", [*MOMENTS, *long(*np.linspace(0.1, 1, 19))])
 def test_kill_costs_the_last_chunk(tmp_path: Path, share: float) -> None:
     """Killed at any moment, a recording opens and lacks less than a chunk of each band."""
     taken, path = killed(tmp_path, share), tmp_path / "killed.zarr"
@@ -151,7 +151,7 @@ def listed(folder: Path | int) -> Names:
         ]
 
 
-@pytest.mark.parametrize("every", [60, pytest.param(11, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("every", [60, *long(11)])
 @pytest.mark.parametrize("early", [True, False])
 def test_power_loss_costs_the_last_chunk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, early: bool, every: int

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from faulty_camera import BANDS
 from file_operations import before_operation, operations_of
+from marks import long
 from refused import assert_raises
 from rig_session import from_yaml, rig
 from test_capture_file import Note, begun, shot
@@ -21,7 +22,7 @@ from dbthermal import store
 from dbthermal.instruments.recording import Preview, notes, open_sweep, record
 
 FRAMES = 15
-EVERY = pytest.mark.parametrize("every", [500, pytest.param(137, marks=pytest.mark.slow)])
+EVERY = pytest.mark.parametrize("every", [500, *long(137)])
 
 
 def renamed(path: Path) -> Path:

@@ -11,13 +11,13 @@ from typing import Any
 
 import hostile_files as hostile
 import pytest
-from marks import long, slow
+from marks import long
 
 from dbthermal import readers
 from reproduction import libraries
 
-SIZES = [100, *slow(1000), *long(10_000)]
-"""Damaged files of a form: the same few in the quick tests, others every week in the slow ones."""
+SIZES = [100, *long(1000, 10_000)]
+"""Damaged files of a form: the same few in the quick tests, others every week in the long ones."""
 
 
 def first_seed(number: int) -> int:

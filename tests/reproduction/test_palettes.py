@@ -12,7 +12,7 @@ import hostile_files as hostile
 import numpy as np
 import pytest
 from hostile_files import coloured, video, wave
-from marks import long, slow
+from marks import long
 from numpy.testing import assert_allclose, assert_array_equal
 from refused import assert_refused, refused
 
@@ -78,7 +78,7 @@ def test_published_scene(mirror: Path) -> None:
     assert_allclose(separated["valid"].mean(), 0.356, rtol=0, atol=0.01)
 
 
-@pytest.mark.parametrize("number", [30, *slow(100), *long(1000)])
+@pytest.mark.parametrize("number", [30, *long(100, 1000)])
 @pytest.mark.parametrize("ending", hostile.CODECS)
 def test_videos(tmp_path: Path, ending: str, number: int) -> None:
     """No cut video passes with other frames; a codec without checksum hides some of the rest.

@@ -101,11 +101,11 @@ def outcome(name: str, seed: int) -> tuple[float, float, float, tuple[str, ...]]
 
 
 def cases() -> Iterator[Any]:
-    """Yield each situation with two seeds; most are slow."""
+    """Yield each situation with two seeds; most are slow, and the second one long."""
     for name in WORLDS:
         for seed in (1, 2, *FURTHER.get(name, ())):
-            slow = [] if name in QUICK and seed == 1 else [pytest.mark.slow]
-            yield pytest.param(name, seed, marks=slow)
+            mark = pytest.mark.long if seed == 2 else pytest.mark.slow
+            yield pytest.param(name, seed, marks=[] if name in QUICK and seed == 1 else mark)
 
 
 @pytest.mark.parametrize(("name", "seed"), [*cases()])
