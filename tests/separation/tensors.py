@@ -298,11 +298,14 @@ def _emission(model: Model, material: Known, work: Work) -> None:
     noise, z, emitted, weights = model.noise, work.straight[0], work.emitted, work.weights
     first, w = work.emissivity[0], work.null_weights
     # Variance of the slope: of the ordinate's noise, and of the abscissa's.
-    kernel = weights * emitted
-    kernel = (kernel - weights * (kernel.sum(0) / weights.sum(0))) / work.energy
-    noise_variance = work.line_variance + first**2 * _curve_variance(model, work, kernel)
-    edges = torch.arange(SPANS + 1) * len(z) // SPANS
-    work.influence = _block_sums(kernel * work.residual, edges).where(~work.known, 0.0)
+    centred = (emitted - (weights * emitted).sum(0) / weights.sum(0)) / work.energy
+    noise_variance = work.line_variance
+    noise_variance = noise_variance + first**2 * _curve_variance(model, work, weights * centred)
+    # Frames that the line leaves out, beside reflections, show how much of them it still holds.
+    near = _tukey(work.residual, work.scale * (bars.FARTHEST / regression.TUNING))
+    edges = -(-torch.arange(SPANS + 1) * len(z) // SPANS)
+    influence = _block_sums(near * centred * work.residual, edges)
+    work.influence = influence.where(~work.known, 0.0)
     walk, upper = _walk(model, work)
     limit = (1.0 - first) * model.drift
     change = emitted.amax(dim=0) - emitted.amin(dim=0)

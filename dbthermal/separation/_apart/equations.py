@@ -184,8 +184,7 @@ def _among(weights: csr_array, solved: Mask, width: int) -> tuple[csr_array, Mas
     """Weights of solved pixels alone, and the solved pixels for which that is possible."""
     weights = without(weights, ~solved, width)
     weights.eliminate_zeros()
-    used = np.diff(weights.indptr) > 0
-    return weights, solved & used & (abs(weights) @ ~solved <= 0.0)
+    return weights, solved & (np.diff(weights.indptr) > 0) & (abs(weights) @ ~solved <= 0.0)
 
 
 @lru_cache

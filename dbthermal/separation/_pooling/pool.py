@@ -73,9 +73,7 @@ class Image:
     ) -> gradients.Gradient:
         """Gradient at all pixels of a label within limits, from surveyed ones; `gradients.fit`."""
         asked = np.flatnonzero(self.labels == label)
-        start, places = (
-            np.divmod(pixels, self.width) for pixels in (self.surveyed[measured], asked)
-        )
+        start, places = divmod(self.surveyed[measured], self.width), divmod(asked, self.width)
         result = gradients.fit(start, places, cost)
         # A polynomial may leave the limits beyond the surveyed pixels: then it is a constant.
         within = (result.value > limits[0]) & (result.value < limits[1])

@@ -20,12 +20,12 @@ RESTING: Final = 0.3
 # Degrees of the polynomials over which a spectrum is averaged: from, and up to, not including;
 # and degrees of freedom lost: of the first three, one is along the object's curve.
 OCTAVES: Final = ((1, 4, 1), (4, 8, 0))
-# Bound of a 95 % interval of the normal distribution.
-NORMAL95: Final = float(ndtri(0.975))
-LAGS: Final = 5
-"""Frames over which a residual's mean autocorrelation is taken."""
-CHANGE: Final = 5.0
-"""Deviations of noise from which a difference between frames is a change."""
+NORMAL95: Final = float(ndtri(0.975))  # bound of a 95 % interval of the normal distribution
+LAGS: Final = 5  # frames over which a residual's mean autocorrelation is taken
+CHANGE: Final = 5.0  # deviations of noise from which a difference between frames is a change
+# Largest residual, in deviations, by which spans of time tell an emissivity's error: by 4.685, 5.3
+# and 6, emissivities of 24 materials in simulated worlds are 1.2, 1.0 and .8 stated deviations off.
+FARTHEST: Final = 5.3
 _BLOCK: Final = 9  # frames of the shortest blocks of a residual
 
 
@@ -163,11 +163,13 @@ def bars(model: Model, record: Any, line: Line, work: Work, covariance: Any) -> 
     first, noise_variance, drift_variance = work.emissivity[0], work.material[2], work.material[3]
     walk, upper = _walk(model, first**2 * null, count, work)
     if not line.known:
+        # Frames that the line leaves out, beside reflections, show how much of them it still holds.
+        inverse = 1.0 / (FARTHEST * line.scale)
         for t in range(z.size):
-            kernel[t] = weights[t] * (emitted[t] - product / total) / line.energy
-        for span in range(SPANS):
-            for t in range(span * z.size // SPANS, (span + 1) * z.size // SPANS):
-                record.influence[span] += kernel[t] * work.residual[t]
+            centred = (emitted[t] - product / total) / line.energy
+            kernel[t] = weights[t] * centred
+            near = regression.bisquare(work.residual[t] * inverse)
+            record.influence[t * SPANS // z.size] += near * centred * work.residual[t]
         noise_variance = line.variance
         noise_variance += first**2 * _curve_variance(model, kernel, count, null, work)
         limit = (1.0 - first) * model.drift
