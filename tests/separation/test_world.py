@@ -153,7 +153,7 @@ def test_lenses_that_blur_unlike_leave_the_ratio(seed: int) -> None:
 
 @pytest.mark.slow
 def test_materials_are_as_certain_as_they_say() -> None:
-    """Of emissivities of materials 92 % hold, by bars of at most twice the errors without drift."""
+    """Emissivities of two materials: 92 % hold, bars match errors; without the part by a drift."""
     world, scores = World(), []
     for seed in range(1, 9):
         result = separation.separate(seen(world, seed)[0], RESPONSE)
@@ -165,7 +165,7 @@ def test_materials_are_as_certain_as_they_say() -> None:
     score = float(np.mean(np.square(scores)) ** 0.5)
     print(f"errors of materials: {score:.2f} deviations (root mean square)")
     assert np.mean(np.abs(scores) < 1.96) >= 0.92
-    assert 0.5 < score < 1.4
+    assert 0.7 < score < 1.4
 
 
 def test_nothing_is_far_off_at_a_border_of_materials() -> None:

@@ -391,7 +391,7 @@ def _material(image: Image, common: Material, labels: Labels, survey: Survey) ->
     # All pixels mirror the same people: var(mean) = sum_s (sum_i w k_s)^2 n / (n - 2) of n spans of
     # time, of the residual's influence k in each (Liang, Zeger 1986, doi:10.1093/biomet/73.1.13),
     # beside that of the noise (Cameron et al. 2011, doi:10.1198/jbes.2010.07136).
-    spans = [total(where, weight * np.nan_to_num(each), count) for each in survey.influence]
+    spans = [total(where, weight * np.nan_to_num(span), count) for span in survey.influence]
     timed = np.var(spans, axis=0) * len(spans) ** 2 / (len(spans) - 2) / whole**2
     common_error = np.maximum(timed - expected, 0.0)
     result = replace(
