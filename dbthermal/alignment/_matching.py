@@ -10,7 +10,6 @@ from functools import partial
 from typing import Final
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
 
 from dbthermal._arrays import Array, Mask
 from dbthermal.alignment import _splines as images
@@ -128,7 +127,7 @@ def _whole_pixels(
     where[:, unmoved] = np.reshape(reach, (2, 1))
     best = np.where(unmoved, _UNMOVED * still, best - still)
     # Weight: share of the movies' energy in a window that is explained.
-    share = best / np.maximum(gaussian_filter(sum(energies[1:]), WINDOW), 1e-9)
+    share = best / np.maximum(images.blurred(np.sum(energies[1:], axis=0), WINDOW), 1e-9)
     return where - np.reshape(reach, (2, 1, 1)), np.where(best > chance, share, 0.0)
 
 
@@ -163,7 +162,7 @@ def _information(
     places, used = movies.pairs(shift)
     noise = movies.noise[0] * _VALUE_NOISE
     total = np.zeros((*used.shape, 6))
-    window = partial(gaussian_filter, sigma=WINDOW)
+    window = partial(images.blurred, width=WINDOW)
     numbers = np.maximum(window(used * np.float32(1.0)), 1e-9)[..., np.newaxis] * movies.freedom
     weights = np.where(used[..., np.newaxis], misfits**-_EXCLUDED, np.float32(0.0))
     moments, events = images.products(movies.first, movies.targets, places, weights)
@@ -304,7 +303,7 @@ def delay(movies: Movies, rate: Movie, shift: Array, misfits: Movie) -> tuple[fl
     totals = np.zeros((4, *movies.valid.shape))
     for array, weight, level in zip(moments, weights, movies.noise[1:], strict=True):
         windows = images.blurred(array, WINDOW)
-        freedom = gaussian_filter(weight @ movies.freedom, WINDOW)
+        freedom = images.blurred(weight @ movies.freedom, WINDOW)
         # Noise of the slopes and of the moved movie.
         less = freedom[..., np.newaxis] * movies.noise[0] ** 2
         less = less * np.square([_VALUE_NOISE, _SLOPE_NOISE, _SLOPE_NOISE, 0.0])

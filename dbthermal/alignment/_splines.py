@@ -19,10 +19,10 @@ import numpy.typing as npt
 from scipy import sparse
 from scipy.interpolate import BSpline
 from scipy.linalg import block_diag, cho_solve, cholesky
-from scipy.ndimage import gaussian_filter
 
 from dbthermal._arrays import Array
 from dbthermal._compiled import compiled
+from dbthermal._samples import gaussian
 
 Movie = npt.NDArray[np.float32]
 Image = TypeVar("Image", bound=npt.NDArray[Any])
@@ -47,8 +47,10 @@ def binned(image: npt.NDArray[Any], factor: int) -> npt.NDArray[Any]:
 
 
 def blurred(image: Image, width: float) -> Image:
-    """Image (y, x, plane) blurred by a Gaussian of a width [pixel], mirrored at the border."""
-    result: Image = gaussian_filter(image, width, axes=(0, 1))
+    """Image (y, x, ...) blurred by a Gaussian of a width [pixel], mirrored at the border."""
+    rows, columns = (gaussian(size, width).astype(image.dtype) for size in image.shape[:2])
+    down = (rows @ image.reshape(len(rows), -1)).reshape(*image.shape[:2], -1)
+    result: Image = (columns @ down).reshape(image.shape)
     return result
 
 
