@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import xarray as xr
-from scipy.ndimage import gaussian_filter1d, map_coordinates, uniform_filter
+from scipy.ndimage import gaussian_filter1d, uniform_filter
 from scipy.special import bdtrc, ndtri
 
 from dbthermal._arrays import Array, Mask, stride
@@ -31,7 +31,6 @@ _GAP: Final = 1.5  # deviation of the weights that fill a gap [pixel]
 PIXELS: Final = 16  # pixels, about, from which noise and step of the counts are estimated
 # Width of the mean over pixels of the noise of resampled counts, and steps in time.
 _AROUND, _STEPS = 5, 700
-_FINE: Final = 8.0  # steps in a wide Gaussian's deviation: means are 0.2 % (rms) off, 3 at edges
 _AT_ONCE: Final = 2**17  # samples that are compared in one pass, to stay in the cache
 
 _STILLEST: Final = 0.1  # share of the groups of frames with the least motion
@@ -311,37 +310,22 @@ def _needed(frames: int, chance: float) -> int:
     return max(FEWEST, int(np.ceil(np.log(_FALSE_ALARM / frames) / np.log(max(chance, tiny)))))
 
 
+@lru_cache(maxsize=32)
+def gaussian(size: int, width: float, mode: str = "reflect") -> Array:
+    """Matrix (place, pixel) that blurs a row of pixels by a Gaussian [pixel]."""
+    # Of rows of up to 600 pixels, products of matrices are as fast as a filter, or faster.
+    return np.asarray(gaussian_filter1d(np.eye(size), width, axis=0, mode=mode))
+
+
 def neighbour_mean(
     values: npt.NDArray[np.floating], weight: npt.NDArray[np.floating], width: float
 ) -> Array:
     """Weighted mean (..., y, x) around each pixel by a Gaussian [pixel]; NaN without a weight."""
     weighted = np.where(weight > 0, weight * values, 0.0), weight * 1.0
-    sums = [_gaussian(images, width) for images in weighted]
-    empty = np.full(sums[0].shape, np.nan)
-    return np.asarray(np.divide(sums[0], sums[1], out=empty, where=sums[1] > 0))
-
-
-@lru_cache(maxsize=64)
-def gaussian(size: int, width: float, mode: str = "reflect") -> Array:
-    """Matrix (place, pixel) that blurs a row of pixels by a Gaussian [pixel]."""
-    # Products of matrices are faster than a filter of each row; of rows of 600 pixels as fast.
-    return np.asarray(gaussian_filter1d(np.eye(size), width, axis=0, mode=mode))
-
-
-def _gaussian(images: npt.NDArray[np.floating], width: float) -> Array:
-    """Images (..., y, x) times a Gaussian [pixel], zero around; a wide one at every few pixels."""
-    step = max(1, int(width / _FINE))
-    rows, columns = (np.arange(0, size, step) for size in images.shape[-2:])
-    sums = np.add.reduceat(np.add.reduceat(images, rows, axis=-2), columns, axis=-1)
-    down, along = (gaussian(it.size, width / step, "constant") for it in (rows, columns))
-    sums = down @ sums @ along.T
-    if step == 1:
-        return np.asarray(sums)
-    # Interpolate between the middles of the blocks of pixels.
-    place = (np.indices(images.shape[-2:]) - 0.5 * (step - 1)) / step
-    flat = sums.reshape(-1, *sums.shape[-2:])
-    fine = [map_coordinates(image, place, order=1, mode="nearest") for image in flat]
-    return np.reshape(fine, images.shape)
+    rows, columns = (gaussian(size, width, "constant") for size in weight.shape[-2:])
+    total, weights = (rows @ images @ columns.T for images in weighted)
+    empty = np.full(total.shape, np.nan)
+    return np.asarray(np.divide(total, weights, out=empty, where=weights > 0))
 
 
 def without_gaps(image: npt.NDArray[Any], valid: Mask) -> npt.NDArray[Any]:

@@ -10,9 +10,9 @@ HOUSE = Path(dbthermal.__file__).parent
 
 # Lines and modules that a room may have. A room that grows takes from another; these only fall.
 BUDGET = {
-    "": (3475, 15),
+    "": (3468, 15),
     "_cli": (1251, 5),
-    "alignment": (2799, 10),
+    "alignment": (2802, 10),
     "calibration": (738, 2),
     "correction": (1704, 5),
     "emissivity": (402, 1),
@@ -22,11 +22,11 @@ BUDGET = {
     "limits": (659, 2),
     "readers": (2768, 10),
     "reporting": (362, 1),
-    "separation": (12747, 45),
+    "separation": (12750, 45),
     "simulation": (523, 1),
     "store": (1356, 6),
 }
-INSTALLED = 35_814  # lines of all rooms
+INSTALLED = 35_813  # lines of all rooms
 
 PRONOUNS = {
     *("one", "other", "others", "own", "part", "parts", "some", "here", "there", "told", "known"),

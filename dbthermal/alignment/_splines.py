@@ -75,19 +75,15 @@ def products(
     result = np.empty((len(movies), height, width, count * (count + 1) // 2))
     number = weights.shape[3]
     events = np.empty((len(movies), height, width, 3, number), np.float32)
-    sums = np.empty((_ROWS * width, result.shape[3], number), np.float32)
     for start in range(0, height, _ROWS):
         rows = slice(start, min(start + _ROWS, height))
         signals = sampled(movie, places[:, rows].reshape(2, -1) + _EDGE)
         if rate is not None:
             signals = np.concatenate([signals, (signals[0] @ rate)[np.newaxis]])
-        size = signals.shape[1]
-        signals, used = signals.reshape(count - 1, size, -1, number), sums[:size]
+        signals = signals.reshape(count - 1, -1, width, signals.shape[2] // number, number)
         for place, second in enumerate(movies):
-            _sum_pairs(signals, second[rows].reshape(signals.shape[1:]), used)
-            pairs = used.reshape(-1, width, *used.shape[1:])
-            result[place, rows] = (pairs @ weights[place, rows, :, :, np.newaxis])[..., 0]
-            events[place, rows] = pairs[:, :, [0, count - 1, -1]]
+            arrays = weights[place, rows], result[place, rows], events[place, rows]
+            _sum_pairs(signals, second[rows].reshape(signals.shape[1:]), *arrays)
     return result, events
 
 
@@ -153,20 +149,26 @@ def _cubic(away: float) -> float:
 
 
 @compiled
-def _sum_pairs(signals: Movie, last: Movie, out: Movie) -> None:
-    """Sums over an event's planes (pixel, pair, event) of the products of signals, in place."""
-    count, pixels, turns, events = signals.shape
-    for p in range(pixels):
-        place = 0
+def _sum_pairs(signals: Movie, last: Movie, weights: Movie, sums: Array, events: Movie) -> None:
+    """Sums over planes of the products of signals (signal, y, x, turn, event), in place."""
+    count, height, width, turns, number = signals.shape
+    products = np.empty(number, signals.dtype)
+    for y, x in np.ndindex(height, width):
+        pair = 0
         for i in range(count + 1):
-            first = signals[i, p] if i < count else last[p]
+            first = signals[i, y, x] if i < count else last[y, x]
             for j in range(i, count + 1):
-                second, sums = signals[j, p] if j < count else last[p], out[p, place]
-                sums[:] = 0.0
+                second = signals[j, y, x] if j < count else last[y, x]
+                products[:] = 0.0
                 for turn in range(turns):
-                    for event in range(events):
-                        sums[event] += first[turn, event] * second[turn, event]
-                place += 1
+                    for event in range(number):
+                        products[event] += first[turn, event] * second[turn, event]
+                sums[y, x, pair] = 0.0
+                for event in range(number):
+                    sums[y, x, pair] += products[event] * weights[y, x, event]
+                if i in (0, count) and j in (0, count):
+                    events[y, x, (i + j) // count] = products
+                pair += 1
 
 
 @dataclass(frozen=True)

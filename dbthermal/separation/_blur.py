@@ -9,10 +9,10 @@ pixels. The band that is sharper is blurred, and c is sought again until nothing
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Final, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 import xarray as xr
 from scipy import ndimage
 from scipy.signal import fftconvolve
@@ -46,6 +46,7 @@ _BLOCKS: Final = 8  # of rows that tell it
 # rough surfaces -.5 to -.95; of objects without detail, whose blur does not matter, -.1 to .3.
 _OF_LENS: Final = 0.4
 _LEADING: Final = 64  # functions of time that hold most of the rapid changes of some rows
+_blurred: Final = partial(ndimage.gaussian_filter, mode="nearest")
 
 Sums: TypeAlias = tuple[float, float, float]
 """Of the normal equation of c: its force, its form, and the variance of the force."""
@@ -170,10 +171,6 @@ def _blurred_maps(maps: Array, variance: float) -> Array:
     return blurred[:, reach:-reach, reach:-reach]
 
 
-def _blurred(image: npt.NDArray[np.floating], deviation: float) -> Array:
-    return np.asarray(ndimage.gaussian_filter(image, deviation, mode="nearest"))
-
-
 def _blocks(inputs: Inputs) -> list[slice]:
     """Rows that may tell a blur."""
     if inputs.capture.sizes["x"] < _FEWEST:
@@ -210,7 +207,7 @@ def _difference(inputs: Inputs, result: xr.Dataset, place: int) -> float:
 def _details(image: Array, excess: float) -> Array:
     """An image blurred by an excess [pixel^2], less its broad part, in which rapid heat spreads."""
     fine, broad = (_blurred(image, float(np.sqrt(it + excess))) for it in (_COMMON, _BROAD))
-    return fine - broad
+    return np.asarray(fine - broad)
 
 
 def _equations(

@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from dbthermal import schema
 from dbthermal._arrays import empty, release, without_blas_threads
+from dbthermal._compiled import compiled
 from dbthermal.separation import _budget as budget
 from dbthermal.separation import _tiles as tiles
 from dbthermal.separation._apart import side_by_side
@@ -374,15 +375,14 @@ def _write(
             elif whole:
                 target[...] = values.reshape(target.shape)
             else:
-                _place(target, np.flatnonzero(frames), places, values)
+                _place(target, np.flatnonzero(frames), *np.nonzero(places), values)
         if "time" in dims and invalid.any():
             target[invalid] = np.nan
 
 
-def _place(film: Array, frames: Whole, places: Mask, values: Array) -> None:
-    """Write values (frame, pixel) at some frames and places (y, x) of a film, in place."""
-    if frames.size > values.shape[1]:
-        film[frames[:, np.newaxis], *np.nonzero(places)] = values
-        return
-    for frame, samples in zip(frames, values, strict=True):  # at once it takes four times as long
-        film[frame][places] = samples
+@compiled
+def _place(film: Array, frames: Whole, rows: Whole, columns: Whole, values: Array) -> None:
+    """Write values (frame, pixel) at some frames, rows and columns of a film, in place."""
+    for frame in range(frames.size):
+        for pixel in range(rows.size):
+            film[frames[frame], rows[pixel], columns[pixel]] = values[frame, pixel]

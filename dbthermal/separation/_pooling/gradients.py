@@ -20,6 +20,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+from numpy.polynomial.polynomial import polyvander
 from scipy.special import chdtri, ndtr
 
 from dbthermal._arrays import Array, Mask
@@ -189,7 +190,7 @@ def powers(places: Places, measured: Places, degree: int) -> Array:
     """Products of powers (place, function) of rows and columns, from -1 to 1 at the known ones."""
     # Far from the origin, in pixels, high powers would be alike but for rounding.
     y, x = (
-        (coordinate - those.mean()) / max(float(np.ptp(those)) / 2.0, 1.0)
+        polyvander((coordinate - those.mean()) / max(float(np.ptp(those)) / 2.0, 1.0), degree).T
         for coordinate, those in zip(places, measured, strict=True)
     )
-    return np.stack([y**i * x ** (k - i) for k in range(degree + 1) for i in range(k + 1)], axis=1)
+    return np.stack([y[i] * x[k - i] for k in range(degree + 1) for i in range(k + 1)], axis=1)

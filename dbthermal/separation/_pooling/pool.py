@@ -9,9 +9,10 @@ from typing import Final, TypeAlias
 
 import numpy as np
 import xarray as xr
-from scipy.ndimage import gaussian_filter, maximum_filter, median_filter, minimum_filter
+from scipy.ndimage import maximum_filter, median_filter, minimum_filter
 
 from dbthermal._arrays import release
+from dbthermal._samples import neighbour_mean
 from dbthermal.schema import Status
 from dbthermal.separation._inputs import Inputs, Labels
 from dbthermal.separation._pooling import gradients
@@ -41,8 +42,7 @@ _HARDLY: Final = 0.5  # deviation of a ratio pooled over that alone, from which 
 _MOSTLY: Final = 0.5  # share of gray pixels from which their material is [1]
 # Square of the difference in deviations that is no chance, of a pixel and of its neighbours [1].
 _UNLIKELY, _UNLIKELY_MEAN = 4.0, 1.5
-# Deviation of the neighbourhood that shares such errors [pixel], and its least weight [1].
-_VICINITY, _LEAST_WEIGHT = 1.5, 1e-3
+_VICINITY: Final = 1.5  # deviation of the neighbourhood that shares such errors [pixel]
 _FRAMES: Final = 64  # that tell how much an object differs, about
 
 _OUTLIER_SIGMAS: Final = 4.0  # deviations beyond which a pixel is not of the material
@@ -468,14 +468,14 @@ def hold(
         release()
     # Of cameras apart, pixels that stay alone have their deviations widened, too.
     unlike = np.where(stay & apart & (square > _UNLIKELY), square, 0.0)
-    local = np.where(common, _neighbour_mean(square, common), 0.0)
+    local = np.where(common, neighbour_mean(square, common, _VICINITY), 0.0)
     whole, size = median_filter(labels.values, _SINGLE, mode="nearest"), 1 + 2 * _REACH
     border = minimum_filter(whole, size) < maximum_filter(whole, size)
     # D times the variance alone is added if D of the pixel or around is no chance, or at a border.
     widened = common & (border | (square > _UNLIKELY) | (local > _UNLIKELY_MEAN))
     square = np.where(widened, np.maximum(square, local), 1.0 * (stay & sound))
-    mean = _neighbour_mean(square * variance, common | (stay & sound))
-    constant = np.where(valid & ~sound, mean, 0.0)
+    mean = neighbour_mean(square * variance, common | (stay & sound), _VICINITY)
+    constant = np.where(valid & ~sound, np.nan_to_num(mean), 0.0)
     factor, film = square * common, pooled["object_temperature_std"].values
     maps = [(pooled[it].values, data.values) for it, data in per_pixel.items() if "x" in data.dims]
     wider = (factor > 0) | (constant > 0)
@@ -495,9 +495,3 @@ def _share(labels: Array, holds: Mask) -> Array:
     numbers = np.unique(labels, return_inverse=True)[1].ravel()
     share = np.bincount(numbers, holds.ravel()) / np.bincount(numbers)
     return np.where(labels >= 0, share[numbers].reshape(labels.shape), 0.0)
-
-
-def _neighbour_mean(values: Array, counted: Mask) -> Array:
-    """Mean (y, x) of the known pixels around."""
-    sums = gaussian_filter(np.where(counted, values, 0.0), _VICINITY)
-    return np.asarray(sums / np.maximum(gaussian_filter(counted * 1.0, _VICINITY), _LEAST_WEIGHT))

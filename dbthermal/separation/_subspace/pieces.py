@@ -53,6 +53,12 @@ def blocks(frames: int) -> Whole:
     return np.round(np.linspace(0, frames, 2**levels + 1)).astype(np.intp)
 
 
+@lru_cache(maxsize=64)
+def _polynomials(places: bytes, pieces: int) -> Array:
+    """Polynomials over the times of blocks in pieces of equal numbers: most tiles have the same."""
+    return smooth.polynomial_basis(np.frombuffer(places).reshape(pieces, -1), FUNCTIONS)
+
+
 def asked(sums: Array, time: Array, variance: Array, used: Whole) -> Mask:
     """Pixels whose smooth curve is described shorter in pieces."""
     # Sums (block, pixel) [K] of the null residual and of the curve taken from it.
@@ -68,7 +74,7 @@ def asked(sums: Array, time: Array, variance: Array, used: Whole) -> Mask:
     for level in range(levels - 2, -1, -1):
         # Energy outside the functions of each piece of this level, and their cost.
         means = mean.reshape(1 << level, -1, mean.shape[1])
-        held = smooth.polynomial_basis(places.reshape(len(means), -1), FUNCTIONS).mT @ means
+        held = _polynomials(places.tobytes(), len(means)).mT @ means
         energy = np.einsum("itp,itp->ip", means, means) - np.einsum("ijp,ijp->ip", held, held)
         cost = energy + COST * FUNCTIONS
         halves = least[::2] + least[1::2] if level < levels - 2 else np.full_like(cost, np.inf)
