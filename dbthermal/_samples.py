@@ -321,8 +321,9 @@ def neighbour_mean(
     values: npt.NDArray[np.floating], weight: npt.NDArray[np.floating], width: float
 ) -> Array:
     """Weighted mean (..., y, x) around each pixel by a Gaussian [pixel]; NaN without a weight."""
-    weighted = np.where(weight > 0, weight * values, 0.0), weight * 1.0
-    rows, columns = (gaussian(size, width, "constant") for size in weight.shape[-2:])
+    weight = np.where(np.isfinite(values), weight, 0.0)
+    rows, columns = (gaussian(size, width, "constant") for size in values.shape[-2:])
+    weighted = weight * np.nan_to_num(values), weight
     total, weights = (rows @ images @ columns.T for images in weighted)
     empty = np.full(total.shape, np.nan)
     return np.asarray(np.divide(total, weights, out=empty, where=weights > 0))
