@@ -8,7 +8,7 @@ from typing import Any, ParamSpec
 import pytest
 
 Arguments = ParamSpec("Arguments")
-Errors = type[Exception] | tuple[type[Exception], ...]
+Errors = type[BaseException] | tuple[type[BaseException], ...]
 REFUSALS = (KeyError, TypeError, ValueError)
 
 

@@ -11,7 +11,7 @@ import pytest
 from faulty_camera import BANDS
 from file_operations import before_operation, operations_of
 from marks import long
-from refused import assert_raises
+from refused import assert_raises, assert_refused
 from rig_session import from_yaml, rig
 from test_capture_file import Note, begun, shot
 from test_killed import check
@@ -151,8 +151,7 @@ def test_without_a_chunk_it_is_not_complete(tmp_path: Path, piece: str) -> None:
             shutil.rmtree(gone) if gone.is_dir() else gone.unlink()
 
     assert_raises(FileNotFoundError, rf"{piece}.*'", write, path, lose)
-    with pytest.raises(ValueError, match=f"Missing file '{piece}"):
-        store.open_dataset(path)
+    assert_refused(f"Missing file '{piece}", store.open_dataset, path)
 
 
 def test_a_recorder_follows_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

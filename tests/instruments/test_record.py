@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from faulty_camera import BANDS, Faults, FaultyCamera, two_bands, two_cameras
+from refused import assert_raises, assert_refused
 from rig_session import LIMIT
 from test_capture_file import CaptureFile
 
@@ -126,8 +127,7 @@ def test_last_source_lost_ends_it(tmp_path: Path) -> None:
     never = Faults(unplugged=0)
     record(session(), bench(never, never), tmp_path / "b.zarr", limits=SMALL)
     assert store.open_dataset(tmp_path / "b.zarr").sizes["time"] == 0
-    with pytest.raises(ValueError, match="Empty 'counts' of the corrected"):
-        open_capture(tmp_path / "b.zarr")
+    assert_refused("Empty 'counts' of the corrected", open_capture, tmp_path / "b.zarr")
 
 
 def test_errors_end_it_and_keep_what_came(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -144,8 +144,7 @@ def test_errors_end_it_and_keep_what_came(tmp_path: Path, monkeypatch: pytest.Mo
     with pytest.raises(ZeroDivisionError):
         record(session(9.0), bench(), names[1], limits=SMALL, preview=fail)
     monkeypatch.setattr(FaultyCamera, "read", Mock(side_effect=SystemExit("left")))
-    with pytest.raises(SystemExit, match="left"):
-        record(session(9.0), bench(), names[2], limits=SMALL)
+    assert_raises(SystemExit, "left", record, session(9.0), bench(), names[2], limits=SMALL)
     cases = zip(names, ("error", "interrupted", "error"), (1, 1, 0), strict=True)
     for path, ended, frames in cases:
         opened = store.open_dataset(path)

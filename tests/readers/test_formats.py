@@ -11,6 +11,7 @@ import xarray as xr
 import zarr
 from flir_files import scene
 from numpy.testing import assert_array_equal
+from refused import assert_refused
 
 from dbthermal import readers
 from dbthermal.__main__ import main
@@ -78,13 +79,12 @@ def test_foreign_formats_are_named(tmp_path: Path) -> None:
         "P5\n24 32": "PGM: save it as PNG",
         "\x80\x04\x95": "pickle: save its array",
     }
-    path, options = tmp_path / "a.dat", {"unit": "count", "clock": 10.0}
+    path, stated = tmp_path / "a.dat", {"unit": "count", "clock": 10.0}
+    options: dict[Any, Any] = {readers.flir: {}, readers.tiff: stated, readers.array: stated}
     for start, expected in starts.items():
         path.write_bytes(start.encode("latin-1") + bytes(100))
-        for read in (readers.flir, readers.tiff, readers.array):
-            stated: Any = {} if read is readers.flir else options
-            with pytest.raises(ValueError, match=rf"Refused 'a\.dat', a {expected}"):
-                read(path, **stated)
+        for read, form in options.items():
+            assert_refused(rf"Refused 'a\.dat', a {expected}", read, path, **form)
     ways = {
         "ravi": "export its counts as 16-bit TIFF",
         "irb": "export its counts",
@@ -92,8 +92,7 @@ def test_foreign_formats_are_named(tmp_path: Path) -> None:
     }
     for suffix, way in ways.items():
         (tmp_path / f"a.{suffix}").write_bytes(b"something else")
-        with pytest.raises(ValueError, match=rf"Refused 'a\.{suffix}': {way}"):
-            readers.flir(tmp_path / f"a.{suffix}")
+        assert_refused(rf"Refused 'a\.{suffix}': {way}", readers.flir, tmp_path / f"a.{suffix}")
 
 
 @pytest.mark.parametrize("name", ["a.csv", "a.tif", "a.npy", "a"])
@@ -119,8 +118,7 @@ def test_another_reader_is_named(tmp_path: Path) -> None:
     ):
         with pytest.raises(ValueError, match=rf"Must be read by readers\.{right}"):
             wrong(tmp_path / name, unit="count", clock=10.0)
-    with pytest.raises(ValueError, match=r"Must be read by readers\.sequence"):
-        readers.flir(tmp_path / "a.hcc")
+    assert_refused(r"Must be read by readers\.sequence", readers.flir, tmp_path / "a.hcc")
 
 
 @pytest.mark.parametrize("form", [*hostile.FLIR, *hostile.TIFF])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from captures import emissivity_of
+from refused import assert_raises, assert_refused
 
 from dbthermal import response as responses
 from dbthermal import simulation, store
@@ -65,8 +66,7 @@ def test_truth_at_the_times_of_a_capture() -> None:
     found = emulated.shown(began, capture)
     np.testing.assert_allclose(found["object_temperature"][:, 0, 0], [302.5, 303.5], atol=1e-9)
     np.testing.assert_allclose(found["time"], [0.05, 0.15])
-    with pytest.raises(ValueError, match="Invalid times"):
-        emulated.shown(began, capture.assign_attrs(clock_origin=99.0))
+    assert_refused("Invalid times", emulated.shown, began, capture.assign_attrs(clock_origin=99.0))
 
 
 def test_thermocouple_follows_what_it_touches() -> None:
@@ -99,8 +99,7 @@ def test_truth_lies_beside_the_recordings(tmp_path: Path) -> None:
         elif name:
             (folder / name).write_text("mine", encoding="utf-8")
         if name:
-            with pytest.raises(FileExistsError, match=name):
-                emulated.clear(folder)
+            assert_raises(FileExistsError, name, emulated.clear, folder)
             assert len(list(folder.iterdir())) == 3
         else:
             emulated.clear(folder)

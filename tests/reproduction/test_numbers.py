@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
+from refused import assert_raises, assert_refused
 
 from dbthermal import store
 from reproduction import numbers, verify
@@ -47,8 +48,7 @@ def test_numbers_are_finite(value: Any, tmp_path: Path) -> None:
 def test_damaged_numbers_are_refused(content: str, tmp_path: Path) -> None:
     """A truncated, invalid or foreign file of numbers raises an error with its name."""
     (tmp_path / "a.json").write_text(content)
-    with pytest.raises(ValueError, match=r"a\.json'?.*Must "):
-        numbers.read(tmp_path / "a.json")
+    assert_refused(r"a\.json'?.*Must ", numbers.read, tmp_path / "a.json")
 
 
 def test_no_flipped_bit_passes_as_a_number(tmp_path: Path) -> None:
@@ -92,8 +92,7 @@ def test_same_run_agrees(project: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert capsys.readouterr().out.endswith("3 of 3 numbers agree within 1%, without data\n")
     assert list(json.loads(verify.reference_path().read_text())) == ["without data"]
     assert verify.reference_path().is_relative_to(project)
-    with pytest.raises(FileNotFoundError, match="Missing numbers of run 'smoke'"):
-        verify.read_run("smoke")
+    assert_raises(FileNotFoundError, "Missing numbers of run 'smoke'", verify.read_run, "smoke")
     assert verify.main(["--run", "smoke"]) == 1
     assert "Missing numbers of run 'smoke'" in capsys.readouterr().err
 

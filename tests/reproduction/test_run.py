@@ -8,6 +8,7 @@ import joblib
 import numpy as np
 import pytest
 import xarray as xr
+from refused import assert_raises, assert_refused
 
 from dbthermal import figures, store
 from reproduction import manifest, paths
@@ -81,8 +82,7 @@ def test_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert paths.root() == project
     (project / "data_manifest.yaml").unlink()
     sought = f"'{tmp_path.parent}', nor '{project / 'dbthermal'}'"
-    with pytest.raises(FileNotFoundError, match=sought):
-        paths.root()
+    assert_raises(FileNotFoundError, sought, paths.root)
 
 
 @pytest.mark.usefixtures("run")
@@ -101,5 +101,4 @@ def test_names_are_no_paths() -> None:
     ]
     for kind, place, names in table:
         for name in names:
-            with pytest.raises(ValueError, match=f"Invalid {kind} '{name}'. Must be"):
-                place(name)
+            assert_refused(f"Invalid {kind} '{name}'. Must be", place, name)

@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 from captures import polynomials
 from numpy.typing import NDArray
-from refused import refused
+from refused import assert_refused, refused
 
 from reproduction import uncalibrated
 
@@ -74,8 +74,7 @@ def test_reflection_of_a_scaled_picture() -> None:
     rng = np.random.default_rng(6)
     truth, reflection = scene(rng)
     shown = picture(truth, rng)
-    with pytest.raises(ValueError, match="pixels have a correlation below"):
-        uncalibrated.uncalibrated_reflection(shown)  # for its scale moves all of them together
+    assert_refused("pixels have a correlation below", uncalibrated.uncalibrated_reflection, shown)
     found = uncalibrated.uncalibrated_reflection(uncalibrated.unscaled(shown, WALL))
     functions = polynomials(TIME, found.attrs["order"])
     both = found["reflection"].values, reflection

@@ -7,6 +7,7 @@ import numpy.typing as npt
 import pytest
 import xarray as xr
 from captures import GLASS, emissivity_of, people
+from refused import assert_raises, assert_refused
 from scenes import field, held
 
 from dbthermal import schema, simulation
@@ -144,10 +145,8 @@ def test_a_bad_frame_is_named(
     good: npt.NDArray[np.float32] = capture["counts"].values[:, 0]
     stream.update(0.0, good)
     arguments: dict[str, Any] = {"time": 1.0, "frames": capture["counts"].values[:, 1]} | change
-    with pytest.raises(error, match=match):
-        stream.update(**arguments)
-    with pytest.raises(ValueError, match="no temperatures are known"):
-        stream.result()
+    assert_raises(error, match, stream.update, **arguments)
+    assert_refused("no temperatures are known", stream.result)
     assert stream.update(0.1, capture["counts"].values[:, 1]).sizes["time"] == 0
 
 
