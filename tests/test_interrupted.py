@@ -202,17 +202,12 @@ readers.two_bands = two_bands if sys.argv[1] == "short" else readers.two_bands
 sys.exit(main(sys.argv[2:]))
 """
     words = COMMANDS["import"].split()
-    short = subprocess.run(
-        [sys.executable, "-c", code, "short", *words],
-        cwd=folder, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert short.returncode == 1
-    assert "Out of memory, 'x.zarr' is not written: Unable to allocate 1 TB. Must" in short.stderr
-    dry = subprocess.run(
-        [sys.executable, "-c", code, "dry", *words, "--dry-run", "--json"],
-        cwd=folder, capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    planned = json.loads(dry.stdout)
+    status, error = end(started(folder, code, "short", *words))
+    assert status == 1
+    assert "Out of memory, 'x.zarr' is not written: Unable to allocate 1 TB. Must" in error
+    dry = started(folder, code, "dry", *words, "--dry-run", "--json")
+    planned = json.loads(dry.communicate()[0])
+    assert dry.returncode == 0
     assert 2 * 64 * 8 * 12 * 2 <= planned["would_write_bytes_at_most"] < 30_000
     assert planned["free_bytes"] > 0
     assert beside(folder) == []

@@ -164,11 +164,9 @@ WARM = np.linspace(303.15, 333.15, 8)
 COLD = np.linspace(323.15, 293.15, 8)
 
 
-def readings(
-    of: xr.Dataset, rng: np.random.Generator, stds: tuple[float, float] = STDS
-) -> xr.Dataset:
+def readings(of: xr.Dataset, rng: np.random.Generator) -> xr.Dataset:
     """Eight measurements of glass."""
-    return contact_measurements(of, GLASS, WARM, COLD, stds, rng)
+    return contact_measurements(of, GLASS, WARM, COLD, STDS, rng)
 
 
 @pytest.fixture

@@ -66,15 +66,10 @@ def test_commands_are_the_published_ones() -> None:
         **modes,
     }
     assert {*boson.SETTINGS} == {FOUND[name] for name in SETTINGS}
-    assert {state.name: state.value for state in FfcStatus} == numbered(STATES)
+    assert [(state.value, state.name) for state in FfcStatus] == [*enumerate(STATES.split())]
     assert boson.RUN_FFC == 0x00050007
     assert [*boson.STATUSES] == STATUSES
     assert len({*boson.STATUSES.values()}) == len(STATUSES) - 9  # ten are of the flash memory
-
-
-def numbered(names: str) -> dict[str, int]:
-    """Names with their numbers from 0."""
-    return {name: number for number, name in enumerate(names.split())}
 
 
 @pytest.mark.parametrize("name", SETTINGS)
@@ -83,7 +78,7 @@ def test_every_setting_is_kept(bench: BosonBench, name: str) -> None:
     (command, members), setting = SETTINGS[name], FOUND[name]
     assert isinstance(setting, boson.Setting)
     kind: Any = setting.convert
-    assert {value.name: value.value for value in kind} == numbered(members)
+    assert [(value.value, value.name) for value in kind] == [*enumerate(members.split())]
     for value in kind:
         bench.camera.set(setting, value)
         assert bench.camera.read(setting) is value

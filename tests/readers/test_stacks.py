@@ -4,13 +4,13 @@ import struct
 from pathlib import Path
 from typing import Any
 
-import imagecodecs
 import numpy as np
 import pytest
 import tifffile
 import xarray as xr
 from flir_files import scene
 from hostile_files import written
+from imagecodecs import png_encode
 from numpy.testing import assert_allclose, assert_array_equal
 from refused import assert_refused, raising, refused
 
@@ -29,8 +29,6 @@ FORMS: dict[str, dict[str, Any]] = {
     "strips": {"rowsperstrip": 5},
     "one page": {"truncate": True},
 }
-
-
 HALF = 0.5 * scene().astype("f4")
 HALVES = f"{HALF[0].min():g} to {HALF[0].max():g}"
 GDAL = '<GDALMetadata>\n<Item name="{}" sample="0" role="{}">{}</Item>\n</GDALMetadata>'
@@ -197,14 +195,9 @@ def test_a_strip_unpacks_no_farther_than_its_page(tmp_path: Path) -> None:
     assert_refused("TIFF", read, written(path, content))
 
 
-def picture(path: Path, counts: Any) -> Path:
-    """PNG of gray values or colours."""
-    return written(path, imagecodecs.png_encode(counts))
-
-
 def test_png_of_16_bits(tmp_path: Path) -> None:
     """A PNG a frame, of 16 bits and gray; its form decides, not its name."""
-    paths = [picture(tmp_path / f"a{n}.tif", image) for n, image in enumerate(scene())]
+    paths = [written(tmp_path / f"a{n}.tif", png_encode(image)) for n, image in enumerate(scene())]
     found = read(paths)
     assert_array_equal(found.counts, scene())
     assert found.attrs["format"] == "PNG"
@@ -214,30 +207,28 @@ def test_png_of_16_bits(tmp_path: Path) -> None:
         (gray.astype("u1"), "24 x 32 pixels of 8 bits, .* Must be of 16 bits and gray: counts"),
         (np.stack([gray] * 3, axis=-1), "colours 2, .*Must be of 16 bits and gray"),
     ):
-        assert_refused(message, read, picture(tmp_path / "b.png", counts))
+        assert_refused(message, read, written(tmp_path / "b.png", png_encode(counts)))
     written(paths[1], paths[1].read_bytes()[:-40])
     assert_refused(r"Damaged PNG in 'a1\.tif'", read, paths)
 
 
-IMAGE_J = {"imagej": True}
-
-
 @pytest.mark.parametrize(
-    ("options", "agrees"),
+    ("form", "interval", "agrees"),
     [
-        ({**IMAGE_J, "metadata": {"axes": "TYX", "finterval": 0.1}}, True),
-        ({**IMAGE_J, "metadata": {"axes": "TYX", "finterval": 100, "tunit": "ms"}}, True),
-        ({**IMAGE_J, "metadata": {"axes": "TYX", "finterval": 0.2}}, False),
-        ({"ome": True, "metadata": {"axes": "TYX", "TimeIncrement": 0.1}}, True),
-        ({"ome": True, "metadata": {"axes": "TYX", "TimeIncrement": 0.3}}, False),
-        *(
-            ({"ome": True, "metadata": {"axes": "TYX", "Plane": {"DeltaT": times}}}, agrees)
-            for times, agrees in (([5.0, 5.1, 5.2], True), ([5.0, 5.5, 6.0], False))
-        ),
+        ("imagej", {"finterval": 0.1}, True),
+        ("imagej", {"finterval": 100, "tunit": "ms"}, True),
+        ("imagej", {"finterval": 0.2}, False),
+        ("ome", {"TimeIncrement": 0.1}, True),
+        ("ome", {"TimeIncrement": 0.3}, False),
+        ("ome", {"Plane": {"DeltaT": [5.0, 5.1, 5.2]}}, True),
+        ("ome", {"Plane": {"DeltaT": [5.0, 5.5, 6.0]}}, False),
     ],
 )
-def test_intervals_of_a_description(tmp_path: Path, options: Any, agrees: bool) -> None:
+def test_intervals_of_a_description(
+    tmp_path: Path, form: str, interval: dict[str, Any], agrees: bool
+) -> None:
     """An interval or times of ImageJ and OME that the clock contradicts are refused."""
+    options = {form: True, "metadata": {"axes": "TYX", **interval}}
     write(path := tmp_path / "a.tif", scene(), **options)
     with raising(None if agrees else r"Invalid times of .* Must agree to half a frame"):
         assert_array_equal(read(path).counts, scene())

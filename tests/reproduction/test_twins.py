@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 import xarray as xr
+from numpy.random import default_rng
 from refused import refused
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
@@ -32,16 +33,11 @@ RESPONSE = Rig().response()
 OBJECT, BACKGROUND = "object_temperature", "background_temperature"
 
 
-def rng(seed: int = 1) -> np.random.Generator:
-    """Seeded random numbers."""
-    return np.random.default_rng(seed)
-
-
 @pytest.mark.parametrize("name", TWINS)
 def test_scene_is_complete(name: str) -> None:
     """A scene of `separated` that a rig observes; the same seed gives it, another others."""
     options = {"spacing": 0.006} if name == "fingerprint" else {}  # m: a coarse mesh is quick
-    scene = twins.twin(name, SHORT, rng(), **options)
+    scene = twins.twin(name, SHORT, default_rng(1), **options)
     for part in (OBJECT, BACKGROUND, "emissivity"):
         schema.check_variable(scene[part], schema.STAGES["separated"][part], part)
     assert (scene.attrs["origin"], scene.attrs["twin"]) == ("simulated", name)
@@ -53,10 +49,10 @@ def test_scene_is_complete(name: str) -> None:
     assert (name in FILLED) == (not beyond.any())
     emitted, seen = (scene[part].values[:, beyond] for part in (OBJECT, BACKGROUND))
     np.testing.assert_array_equal(emitted, seen)
-    corrected = schema.check(simulation.observe(scene, RESPONSE, rng()), "corrected")
+    corrected = schema.check(simulation.observe(scene, RESPONSE, default_rng(1)), "corrected")
     assert corrected["counts"].shape[1:] == scene[OBJECT].shape
     if name in ("fingers", "fingerprint"):
-        again, other = (twins.twin(name, SHORT, rng(seed), **options) for seed in (1, 2))
+        again, other = (twins.twin(name, SHORT, default_rng(seed), **options) for seed in (1, 2))
         xr.testing.assert_identical(again, scene)
         assert scene[BACKGROUND].equals(other[BACKGROUND]) == (name == "fingerprint")
 
@@ -66,7 +62,7 @@ def test_scene_is_complete(name: str) -> None:
 @pytest.mark.parametrize("name", TWINS)
 def test_nothing_comes_before_the_object(name: str, seed: int) -> None:
     """No actor hides a pixel of the object from the camera in 35 s, with any of three seeds."""
-    seen, time = TWINS[name](LONG, rng(seed)), LONG.time
+    seen, time = TWINS[name](LONG, default_rng(seed)), LONG.time
     directions = seen.camera.directions()
     origins = np.broadcast_to(seen.camera.position, directions.shape)
     hits = Caster(seen.mesh).cast(origins, directions)
@@ -80,11 +76,11 @@ def test_nothing_comes_before_the_object(name: str, seed: int) -> None:
 
 def test_a_scan_is_stood_on_the_table() -> None:
     """A rabbit scanned lying, in millimetres, is 0.15 m high, and seen as a whole."""
-    upright, seen = bodies.rabbit(), bodies.bunny(SHORT, rng())
+    upright, seen = bodies.rabbit(), bodies.bunny(SHORT, default_rng(1))
     places = seen.camera.project(seen.mesh.vertices)
     assert np.all((places > -0.5) & (places < np.array(seen.camera.shape) - 0.5))
     lying = surfaces.moved(upright, Rotation.from_euler("x", -90.0, degrees=True), scale=1e3)
-    stood = bodies.bunny(SHORT, rng(), scan=lying).mesh
+    stood = bodies.bunny(SHORT, default_rng(1), scan=lying).mesh
     np.testing.assert_allclose(stood.vertices[:, 2].min(), 0.0, rtol=0, atol=1e-12)  # m
     np.testing.assert_allclose(np.ptp(stood.vertices[:, 2]), 0.15, rtol=0, atol=1e-12)  # m
     np.testing.assert_allclose(stood.face_normals, upright.face_normals, rtol=0, atol=1e-9)
@@ -97,15 +93,15 @@ VESSELS = ["wineglass", pytest.param("coffee_pot", marks=pytest.mark.slow)]
 def test_vessels_peak_where_the_paper_s_did(name: str) -> None:
     """The outer wall at the thermocouple peaks at 63.6 and 63.1 degrees Celsius."""
     celsius = {"wineglass": 63.6, "coffee_pot": 63.1}[name]
-    scene = twins.twin(name, SLOW, rng())
-    readings = stage.thermocouple_readings(scene, rng(), std=0.0, offset_std=0.0, bead=1)
+    scene = twins.twin(name, SLOW, default_rng(1))
+    readings = stage.thermocouple_readings(scene, default_rng(1), std=0.0, offset_std=0.0, bead=1)
     np.testing.assert_allclose(float(readings.max()) - 273.15, celsius, rtol=0, atol=0.15)  # K
 
 
 def test_prints_fade() -> None:
     """A print only fades from the start; a far person moves the background alone."""
     alone, visited = (
-        twins.twin("fingerprint", SLOW, rng(), spacing=0.006, visitor=visitor)
+        twins.twin("fingerprint", SLOW, default_rng(1), spacing=0.006, visitor=visitor)
         for visitor in (False, True)
     )
     peak = alone[OBJECT].max(("y", "x")).values - AMBIENT
@@ -161,10 +157,10 @@ def test_nothing_aliases(name: str) -> None:
     """Resampled by the true shift, the second band's reflection is that of the first, but for a
     tenth of the change: bodies are at several distances, pixels pass what is finer than they are.
     """
-    scene = twins.twin(name, LARGE, rng())
+    scene = twins.twin(name, LARGE, default_rng(1))
     seen = scene.assign(emissivity=0.0 * scene["emissivity"] + 1e-6)
     quiet = RESPONSE.assign(noise=0.0 * RESPONSE["noise"])
-    views = stage.registered(seen, stage.observe(seen, quiet, rng()))
+    views = stage.registered(seen, stage.observe(seen, quiet, default_rng(1)))
     kelvin = response.apparent_temperature(RESPONSE, views["counts"]).values
     known = (scene["shift"].notnull().all("axis") & scene["on_object"]).values
     moved = (np.indices(known.shape) + scene["shift"].values)[:, known]
@@ -183,9 +179,9 @@ def test_the_lens_keeps_the_mean() -> None:
 
 def test_a_surface_is_registered() -> None:
     """By the geometry both bands show the same point of the surface; hidden ones are missing."""
-    scene = twins.twin("coffee_pot", replace(LARGE, time=clock(3)), rng())
+    scene = twins.twin("coffee_pot", replace(LARGE, time=clock(3)), default_rng(1))
     seen = scene.assign(emissivity=0 * scene["emissivity"] + 0.999999)
-    views = stage.registered(seen, stage.observe(seen, RESPONSE, rng()))
+    views = stage.registered(seen, stage.observe(seen, RESPONSE, default_rng(1)))
     kelvin = response.apparent_temperature(RESPONSE, views["counts"])
     apart = (kelvin[1] - kelvin[0]).where(scene["on_object"]).mean("time")
     assert float(abs(apart).quantile(0.9)) < 1.0  # [K], of 40 K from level to rim, in noise
@@ -195,31 +191,33 @@ def test_a_surface_is_registered() -> None:
 
 def test_thermocouples_read_the_mean_under_the_bead() -> None:
     """Without errors a reading is the mean of 3 x 3 pixels; a probe's offset is constant."""
-    scene = twins.twin("glass_plate", SHORT, rng())
+    scene = twins.twin("glass_plate", SHORT, default_rng(1))
     y, x = int(scene["thermocouple_y"][0]), int(scene["thermocouple_x"][0])
     near = scene[OBJECT][:, y - 1 : y + 2, x - 1 : x + 2].mean(("y", "x"))
-    exact = stage.thermocouple_readings(scene, rng(), std=0.0, offset_std=0.0)[0]
+    exact = stage.thermocouple_readings(scene, default_rng(1), std=0.0, offset_std=0.0)[0]
     np.testing.assert_allclose(exact, near, rtol=0, atol=1e-9)  # K
-    shifted = stage.thermocouple_readings(scene, rng(), std=0.0, offset_std=0.5)[0] - exact
+    shifted = stage.thermocouple_readings(scene, default_rng(1), std=0.0, offset_std=0.5)[0] - exact
     assert abs(float(shifted[0])) > 0.01
     np.testing.assert_allclose(shifted, shifted[0], rtol=0, atol=1e-9)  # K
 
 
 def bead(name: str, size: int) -> Callable[[], object]:
     """Readings of a twin by a bead of some pixels."""
-    return lambda: stage.thermocouple_readings(twins.twin(name, SHORT, rng()), rng(), bead=size)
+    return lambda: stage.thermocouple_readings(
+        twins.twin(name, SHORT, default_rng(1)), default_rng(1), bead=size
+    )
 
 
 def probe(height: float, angle: float) -> Callable[[], object]:
     """A wineglass with a thermocouple at a height [m] and an angle [degree]."""
     moved = replace(bodies.WINEGLASS, probe=(height, angle))
-    return lambda: twins.twin("wineglass", SHORT, rng(), vessel=moved)
+    return lambda: twins.twin("wineglass", SHORT, default_rng(1), vessel=moved)
 
 
 test_refusals = refused(
     lambda wrong: wrong(),
     [
-        (lambda: twins.twin("teapot", SHORT, rng()), "Unknown twin 'teapot'"),
+        (lambda: twins.twin("teapot", SHORT, default_rng(1)), "Unknown twin 'teapot'"),
         (bead("fingers", 2), "Invalid bead 2 pixels. Must be odd"),
         (bead("coffee_pot", 31), "its bead reaches beyond the object"),
         (probe(0.01, 0.0), "Must be on the object"),

@@ -148,14 +148,14 @@ def test_gaps_of_single_pixels(half: Case) -> None:
 def test_result_of_another_capture_is_refused(half: Case) -> None:
     """Values that do not give the signals back are of another capture."""
     _, _, alone = half
-    _, other, _ = draw(SMALL, 9, 0.86, 0.72)
+    other = painted(9, (0.86, 0.72), SMALL, time=TIME).capture
     with pytest.raises(ValueError, match=r"Must be of the same capture"):
         separation.complete(alone, other, RESPONSE)
 
 
 def test_bands_of_no_library_are_not_completed() -> None:
     """Bands without a prior on their emissivities are named, and one that is given is taken."""
-    _, capture, _ = draw(SMALL, 7, 0.86, 0.72)
+    capture = painted(7, (0.86, 0.72), SMALL, time=TIME).capture
     names = {"band": ["8-14", "9.1"]}
     other, response = capture.assign_coords(names), RESPONSE.assign_coords(names)
     with pytest.warns(UserWarning, match=r"9\.1.*a prior"):

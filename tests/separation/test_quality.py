@@ -1,5 +1,7 @@
 """Data quality of the counts: bits of bad pixels, and none of good ones."""
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -28,15 +30,11 @@ def plain() -> npt.NDArray[np.float64]:
     return np.asarray(20000.0 + 20.0 * noise)
 
 
-def response_of(noise: float) -> xr.Dataset:
-    """Response of so much noise in both bands [count]."""
+def read(capture: xr.Dataset, noise: float = 20.0, **options: Any) -> xr.Dataset:
+    """Temperatures as the camera reads them by noise [count], with what is said of the samples."""
     response = RIG.response()
-    return response.assign(noise=response["noise"].copy(data=[noise, noise]))
-
-
-def read(capture: xr.Dataset, noise: float = 20.0, **options: xr.DataArray) -> xr.Dataset:
-    """Temperatures as the camera reads them, with what is said of the samples."""
-    return separation.solve(capture, response_of(noise), "apparent", **options)  # type: ignore[arg-type]
+    response = response.assign(noise=response["noise"].copy(data=[noise, noise]))
+    return separation.solve(capture, response, "apparent", **options)
 
 
 def bits(result: xr.Dataset) -> npt.NDArray[np.uint32]:
