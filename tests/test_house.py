@@ -12,7 +12,7 @@ HOUSE = Path(dbthermal.__file__).parent
 BUDGET = {
     "": (3469, 15),
     "_cli": (1251, 5),
-    "alignment": (2802, 10),
+    "alignment": (2800, 10),
     "calibration": (738, 2),
     "correction": (1704, 5),
     "emissivity": (402, 1),
@@ -22,7 +22,7 @@ BUDGET = {
     "limits": (659, 2),
     "readers": (2768, 10),
     "reporting": (362, 1),
-    "separation": (12750, 45),
+    "separation": (12752, 45),
     "simulation": (523, 1),
     "store": (1356, 6),
 }

@@ -12,7 +12,7 @@ one body to the next: differences follow Student's distribution, not a normal on
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +25,6 @@ from dbthermal._compiled import compiled
 from dbthermal._samples import gaussian
 
 Movie = npt.NDArray[np.float32]
-Image = TypeVar("Image", bound=npt.NDArray[Any])
 
 _ROWS: Final = 4  # rows that are moved at a time, and stay in the cache
 _EDGE: Final = 3  # pixels by which an image on splines is mirrored at its border
@@ -46,12 +45,11 @@ def binned(image: npt.NDArray[Any], factor: int) -> npt.NDArray[Any]:
     return np.asarray(sum(corners[1:], corners[0]) * image.dtype.type(factor**-2))
 
 
-def blurred(image: Image, width: float) -> Image:
+def blurred(image: npt.NDArray[Any], width: float) -> npt.NDArray[Any]:
     """Image (y, x, ...) blurred by a Gaussian of a width [pixel], mirrored at the border."""
     rows, columns = (gaussian(size, width).astype(image.dtype) for size in image.shape[:2])
     down = (rows @ image.reshape(len(rows), -1)).reshape(*image.shape[:2], -1)
-    result: Image = (columns @ down).reshape(image.shape)
-    return result
+    return np.asarray((columns @ down).reshape(image.shape))
 
 
 def splines(movie: Movie, width: float) -> Movie:

@@ -375,14 +375,16 @@ def _write(
             elif whole:
                 target[...] = values.reshape(target.shape)
             else:
-                _place(target, np.flatnonzero(frames), *np.nonzero(places), values)
+                row, column = np.array(np.nonzero(places), np.uintp)
+                _place(target, np.flatnonzero(frames), row, column, values)
         if "time" in dims and invalid.any():
             target[invalid] = np.nan
 
 
 @compiled
-def _place(film: Array, frames: Whole, rows: Whole, columns: Whole, values: Array) -> None:
+def _place(film: Array, frames: Whole, row: Whole, column: Whole, values: Array) -> None:
     """Write values (frame, pixel) at some frames, rows and columns of a film, in place."""
     for frame in range(frames.size):
-        for pixel in range(rows.size):
-            film[frames[frame], rows[pixel], columns[pixel]] = values[frame, pixel]
+        image = film[frames[frame]]
+        for pixel in range(row.size):
+            image[row[pixel], column[pixel]] = values[frame, pixel]

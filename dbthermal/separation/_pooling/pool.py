@@ -408,13 +408,13 @@ def _graded(
 ) -> Material:
     """Emissivity with its gradients, from differences of single pixels, variances, and weights."""
     emissivity, variance = material.emissivity.copy(), material.noise_variance.copy()
-    every, fits = np.unique(labels[labels >= 0]), []
-    for label in every:
+    numbers, fits = np.unique(labels[labels >= 0]), []
+    for label in numbers:
         pixels = np.flatnonzero(labels == label)
         difference, noise, weight = (values[pixels] for values in sample)
         cost = gradients.Cost(weight, weight * difference, weight**2 * noise)
         fits.append(image.gradient(label, pixels, cost))
-    for label, fit, spread in zip(every, fits, gradients.spreads(fits), strict=True):
+    for label, fit, spread in zip(numbers, fits, gradients.spreads(fits), strict=True):
         pixels = image.labels == label
         # What differs by no more than the error from drift may be that.
         if np.var(fit.value) + spread > material.drift_variance[pixels][0]:
