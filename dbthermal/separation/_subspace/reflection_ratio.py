@@ -34,12 +34,7 @@ TINY: Final = float(np.finfo(np.float64).tiny)
 
 def principal_ratio(scatter: Array, noise: Array) -> Array:
     """Ratios (band, pixel) [1] of a whitened scatter (pixel, band, band): its principal axis."""
-    if len(noise) == 2:  # of two bands in closed form, which is much faster
-        angle = 0.5 * np.arctan2(2.0 * scatter[..., 0, 1], scatter[..., 0, 0] - scatter[..., 1, 1])
-        axis = np.stack([np.cos(angle), np.sin(angle)])
-    else:
-        axis = np.linalg.eigh(scatter)[1][..., -1].T
-    axis = axis * noise.reshape(len(noise), -1)
+    axis = np.linalg.eigh(scatter)[1][..., -1].T * noise.reshape(len(noise), -1)
     return np.asarray(axis / axis[0])
 
 
