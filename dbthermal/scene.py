@@ -21,7 +21,7 @@ from dbthermal.alignment._resampling import on_one_clock, registered
 from dbthermal.correction import correct_capture
 from dbthermal.separation import separate
 from dbthermal.separation._inputs import decide_noise
-from dbthermal.separation._separate import check_stated
+from dbthermal.separation._separate import check_options
 from dbthermal.store._whole import check_place
 
 __all__ = ["separate_capture"]
@@ -126,7 +126,7 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     # Correct each camera, register the views, and synchronise the bands.
     lazy = made_on_disk()
     names = [str(name) for name in schema.check(capture, "capture")["band"].values]
-    check_stated(names, **separating)
+    check_options(names, **separating)
     corrected = correct_capture(capture, correction, lazy=lazy, **correcting)
     if registration is not None and "transform" not in aligning:
         aligning = {**aligning, "transform": register(corrected, model=registration)}

@@ -3,7 +3,7 @@
 import os
 import random
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
@@ -73,10 +73,8 @@ def write(path: Path, form: str) -> Path:
         path.write_bytes(flir_files.sequence(COUNTS, FLIR[form], sums=form == "fff"))
     elif form in TIFF:
         tifffile.imwrite(path, COUNTS, photometric="minisblack", **TIFF[form])
-    elif form == "raw":
-        COUNTS.tofile(path)
-    elif form in SEQUENCES:
-        path.write_bytes(sfmov(COUNTS) if form == "sfmov" else hcc(COUNTS))
+    elif form in CONTENTS:
+        path.write_bytes(CONTENTS[form](COUNTS))
     elif form == "mat":
         savemat(path, {"frames": np.moveaxis(COUNTS, 0, 2)}, do_compression=True)
     elif form in {"npy", "npz"}:
@@ -131,6 +129,14 @@ def hcc(
         struct.pack_into("<II", header, 100, *clock)
         content += header + frame.astype("<u2").tobytes()
     return content
+
+
+CONTENTS: Final[dict[str, Callable[[NDArray[np.uint16]], bytes]]] = {
+    "raw": np.ndarray.tobytes,
+    "sfmov": sfmov,
+    "hcc": hcc,
+}
+"""Bytes of a file that is made without a library, by its form."""
 
 
 def fate(form: str, before: bytes, after: bytes, recording: xr.Dataset) -> str:

@@ -17,7 +17,7 @@ _FRAMES: Final = 50  # frames and pixels, about, that are judged by the response
 _PIXELS: Final = 2_500
 _OUTSIDE: Final = 0.01  # share of samples outside the calibration that gives a warning
 _HARDLY: Final = 0.2  # share of moving pixels without a flag; below, 50 to 82 % of intervals hold
-_REASONS: Final = 3  # flags that are named
+_FLAGS_NAMED: Final = 3  # flags that are named
 _SAMPLES: Final = 2**24  # of a band, in which a step of a camera's level is sought, at most
 _FEWEST: Final = 100  # pixels in which such a step is sought, at least
 _PAUSE: Final = 1.5  # frame periods, from which two frames do not follow one another
@@ -123,7 +123,7 @@ def hardly_measured(result: xr.Dataset) -> list[str]:
         return []
     bits = [bit for bit in Status if not bit & schema.COMPLETED]
     shares = {bit.label: float(np.mean((status & np.uint32(bit)) != 0)) for bit in bits}
-    reasons = sorted(shares, key=lambda name: -shares[name])[:_REASONS]
+    reasons = sorted(shares, key=lambda name: -shares[name])[:_FLAGS_NAMED]
     named = ", ".join(f"{name} {shares[name]:.0%}" for name in reasons if shares[name] > 0)
     sentences = f"{share:.0%} of the {moving.size} pixels with moving reflections have no flag"
     rule = "dbthermal.schema.Status says what each flag means"

@@ -140,7 +140,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     context = Beside(materials, surroundings, prior, surroundings_std, reflection_shift)
     schema.check_corrected(corrected)
     names = [str(band) for band in corrected["band"].values]
-    completable = check_stated(names, workers, prior, surroundings)
+    completable = check_options(names, workers, prior, surroundings)
     if _numbers.truth_value("outdoors", outdoors) and background_ratio is not None:
         raise ValueError("Invalid outdoors beside a background_ratio. State one of them.")
     response = response.assign(background_ratio_std=SKY) if outdoors else response
@@ -156,7 +156,8 @@ def separate(  # noqa: PLR0913 - all but the first two by name
     laid = overlay(corrected, inputs)
     shift = laid.remaining_shift(reflection_shift) if laid else reflection_shift
 
-    def once(capture: xr.Dataset, field: xr.Dataset | None = shift) -> tuple[Measured, Misfit]:
+    def trial(capture: xr.Dataset, field: xr.Dataset | None = shift) -> tuple[Measured, Misfit]:
+        """Separate a capture, and measure what the model leaves in its bands."""
         scope = inputs
         if capture is not corrected:
             scope = check(capture, response, inputs.method, settings=settings)
@@ -166,13 +167,13 @@ def separate(  # noqa: PLR0913 - all but the first two by name
         )
 
     # Separate, and widen the bars by what is left.
-    capture, (measured, misfit), mended = _mended(laid.capture if laid else corrected, once)
+    capture, (measured, misfit), mended = _mended(laid.capture if laid else corrected, trial)
     if laid:
         detail = laid.detail(measured.inputs, measured.result)
         misfit = replace(misfit, change=np.hypot(misfit.change, detail))
         mended = laid.sentences() + mended
     if colour is not None:
-        capture, scale, (measured, misfit) = _as_gray(capture, once, measured, colour)
+        capture, scale, (measured, misfit) = _as_gray(capture, trial, measured, colour)
     result, materials = measured.result, measured.materials
     misfits.widen(measured.inputs, result, misfit)
     # Complete what is still unknown.
@@ -193,10 +194,10 @@ def separate(  # noqa: PLR0913 - all but the first two by name
 
 
 def _on_one_clock(
-    capture: xr.Dataset, once: Callable[..., tuple["Measured", Misfit]]
+    capture: xr.Dataset, trial: Callable[..., tuple["Measured", Misfit]]
 ) -> tuple[xr.Dataset, tuple["Measured", Misfit], list[str]]:
     """Separate, and again on one clock if the bands show the same at different times."""
-    outcome = once(capture)
+    outcome = trial(capture)
     unchanged = capture, outcome, list[str]()
     names, share = capture["band"].values.tolist(), outcome[0].asynchronous
     if share <= _SOME and not outcome[0].late:
@@ -209,7 +210,7 @@ def _on_one_clock(
     aligned = aligned.assign_coords(time=capture["time"])
     # Not if a band lacks more samples than can be bridged: at steps none is interpolated.
     lost = ~schema.measured(_samples.some_pixels(aligned["counts"]))
-    retry = outcome if lost.mean(axis=(1, 2)).max() > MOST_BRIDGED else once(aligned)
+    retry = outcome if lost.mean(axis=(1, 2)).max() > MOST_BRIDGED else trial(aligned)
     # Nor if it leaves a delay, or a displacement that no shift explains.
     less = retry[0].asynchronous <= max(_LESS * share, _SOME) and not retry[0].late
     if not less or len(retry[0].doubts) > len(outcome[0].doubts):
@@ -223,16 +224,16 @@ def _on_one_clock(
 
 
 def _mended(
-    original: xr.Dataset, once: Callable[..., tuple["Measured", Misfit]]
+    original: xr.Dataset, trial: Callable[..., tuple["Measured", Misfit]]
 ) -> tuple[xr.Dataset, tuple["Measured", Misfit], list[str]]:
     """Separate, and again while what is left shows that clocks or blurs differ, or cameras move."""
-    original, (measured, misfit), late = _on_one_clock(original, once)
+    original, (measured, misfit), late = _on_one_clock(original, trial)
     capture, steady, sentences, remainder = original, None, list[str](), 0.0 * misfit.leak
     for _ in range(_ROUNDS):
         steady = stabilise(original, measured.inputs, measured.result, misfit, steady)
         if steady is None:
             break
-        repeat = once(steady.capture)
+        repeat = trial(steady.capture)
         # Of six worlds that move at most 0.003 of the misfit stays; before a lamp, at rest, 2.1.
         if not repeat[1].size < misfit.size:
             break
@@ -246,7 +247,7 @@ def _mended(
     outcome = measured, misfit
     alike = equalise(capture, measured.inputs, measured.result, misfit)
     # A blur leaves the shift as it is, but less of the texture that tells it.
-    retry = None if alike is None else once(alike.capture, measured.reflection_shift)
+    retry = None if alike is None else trial(alike.capture, measured.reflection_shift)
     if alike and retry and retry[0].sound > _KEPT * measured.sound:
         measured, less = retry
         # Noise that is not white is estimated before the blur, which lessens rapid noise alone.
@@ -325,7 +326,7 @@ def _separated(
 
 def _as_gray(
     corrected: xr.Dataset,
-    once: Callable[[xr.Dataset], tuple[Measured, Any]],
+    trial: Callable[[xr.Dataset], tuple[Measured, Any]],
     measured: Measured,
     colour: Colour,
 ) -> tuple[xr.Dataset, Array, tuple[Measured, Any]]:
@@ -349,7 +350,7 @@ def _as_gray(
         for name in {"noise_factor", *({"pattern_std"} & {*corrected})}:
             before = corrected[name].values if name in corrected else 1.0
             capture[name] = "band", before / np.median(scale, axis=(1, 2))
-        outcome = once(capture)
+        outcome = trial(capture)
         used, scale = scale, colour.scale(outcome[0].result, scale)
         if np.mean(np.abs(scale - used)) < _SETTLED:
             break
@@ -369,7 +370,7 @@ def _restored(result: xr.Dataset, scale: Array, colour: Colour) -> xr.Dataset:
     return result
 
 
-def check_stated(
+def check_options(
     names: list[str], workers: int = 1, prior: Any = None, surroundings: Any = None, **_: Any
 ) -> bool:
     """Tell whether a prior knows the bands; ValueError for what is stated and cannot be."""
