@@ -658,6 +658,7 @@ import a.tif b.tif --bands a b --clock 9 --offset 0 -o folder -> Invalid output 
 info noise.tif -> Damaged TIFF 'noise.tif': not a TIFF file: header=b'
 import folder --bands a b --clock 10 -o x.zarr -> Invalid folder .* Must be files: folder/
 info folder -> Invalid folder 'folder', no whole zarr. Must be files: folder/.*.tif
+{ONE} --offset 0 --rows 5 2 -o x.zarr -> Invalid --rows 5 2. Must be first and end, which is larger
 info a.tif --clock 30 25 -> Invalid --clock of 2 values. Must be one, or one for each camera, here 1
 info nothing*.zarr -> No file or folder 'nothing.*.zarr'
 info 1714*.tif --clock 30 -> Warning: The dates of .* are 1 s apart, by --clock 0.0333 s. Must be

@@ -50,6 +50,7 @@ class World:
     behind: Pair | None = None  # transmittances, with other people behind [1]
     breath: float = 0.0  # motion of the object at 0.25 Hz [pixel]
     surface: tuple[Pair, Pair] = ((0.86, 0.72), (0.93, 0.82))  # emissivities, left and right
+    smooth: bool = False  # one warm spot, and a straight border of the materials
     rate: float = RATE  # of the frames [Hz]
     pace: Pair = (8.0, 20.0)  # of the people [pixel/s]
     together: bool = False  # people all go in one direction
@@ -118,7 +119,9 @@ def seen(world: World, seed: int) -> tuple[xr.Dataset, Array]:
     y, x = np.indices(size)
     time = np.arange(FRAMES) / world.rate
     # The object: two materials, warmed unevenly.
+    wide = np.exp(-np.hypot(y - 0.5 * size[0], x - 0.5 * size[1]) ** 2 / 1000.0)
     coated = x > 0.55 * size[1] + 3.0 * np.sin(y / 9.0)
+    coated = x >= 40 + MARGIN if world.smooth else coated
     texture = gaussian_filter(rng.standard_normal(size), 1.2)
     texture *= world.detail / texture.std()
     emissivity = [
@@ -127,6 +130,7 @@ def seen(world: World, seed: int) -> tuple[xr.Dataset, Array]:
     ]
     warmth = gaussian_filter(rng.standard_normal(size), 9.0)
     warmth = 5.0 + 20.0 * (warmth - warmth.min()) / np.ptp(warmth)
+    warmth = 6.0 + 14.0 * wide if world.smooth else warmth
     rise = 1.0 - np.exp(-2.0 * time / time[-1]) + 0.08 * np.sin(5.0 * time / time[-1])
     truth = ROOM + 1.5 + rise[:, np.newaxis, np.newaxis] * warmth
     spot = np.exp(-np.hypot(y - 0.5 * size[0], x - 0.5 * size[1]) / 12.0)

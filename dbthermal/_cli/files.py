@@ -155,8 +155,8 @@ def between(options: Namespace, name: str, most: int | None = None) -> slice:
     first, end = (ends[0] if len(ends) > 1 else 0), (ends[-1] if ends else most)
     every = vars(options).get("every", 1) if name == "frames" else 1
     if len(ends) > 2 or first < 0 or (end is not None and end <= first):
-        label = f"Invalid --{name} {' '.join(map(str, ends))}"
-        raise ValueError(f"{label}. Must be a number from 1, or first and end: 100 400.")
+        rule = "Must be first and end, which is larger: 100 400; of frames also a number from 1"
+        raise ValueError(f"Invalid --{name} {' '.join(map(str, ends))}. {rule}.")
     if every < 1:
         raise ValueError(f"Invalid --every {every}. Must be 1 or more.")
     return slice(first, end, every)

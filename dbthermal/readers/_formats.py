@@ -51,13 +51,14 @@ _UTF16: Final = (b"\xff\xfe", b"\xfe\xff")  # marks at the beginning of a text
 
 
 def format_of(path: Path) -> str:
-    """Format of a file by its first bytes, empty if unknown; of a folder zarr."""
+    """Format of a file by its first bytes, "" if unknown; of a folder zarr; ValueError if empty."""
     if path.is_dir():
         if not any((path / name).is_file() for name in ("zarr.json", ".zgroup", ".zarray")):
             rule = f"Must be files: {path}/*.tif"
             raise ValueError(f"Invalid folder '{path}', no whole zarr. {rule}.")
         return "zarr"
-    size = texts.regular_file(path, _LARGEST).stat().st_size
+    if (size := texts.regular_file(path, _LARGEST).stat().st_size) == 0:
+        raise ValueError(f"Empty file '{path.name}'. Must hold at least one frame.")
     with path.open("rb") as stream:
         start, place = stream.read(16), 0
         while place < size:
@@ -75,7 +76,7 @@ def refuse_text(path: Path) -> None:
     with path.open("rb") as stream:
         start = stream.read(_TEXT)
     start = start.replace(b"\0", b"" if start.startswith(_UTF16) else b"\0")
-    if start and not re.search(rb"[^\t\r\n -~\x80-\xff]", start):
+    if not re.search(rb"[^\t\r\n -~\x80-\xff]", start):
         raise ValueError(f"Refused '{path.name}', a text: {_FOREIGN['text']}.")
 
 
@@ -102,11 +103,9 @@ def files(path: Paths, reader: str) -> list[Path]:
             rule = "Must be of one camera, and rise: not frame1, frame10, frame2"
             raise ValueError(f"{label}. {rule}: $(ls -v frame*.png).")
     for file in paths:
-        actual = "" if reader == "raw" else reader_of(file)
+        actual = "" if reader == "raw" and not file.is_dir() else reader_of(file)
         if actual not in {"", reader}:
             label = f"Invalid '{file.name}' for readers.{reader}, by its first bytes"
             raise ValueError(f"{label}. Must be read by readers.{actual}.")
-        is_store = actual == "array" and file.is_dir()
-        if not is_store and texts.regular_file(file, _LARGEST).stat().st_size == 0:
-            raise ValueError(f"Empty file '{file.name}'. Must hold at least one frame.")
+        format_of(file)  # an error if it is missing or empty
     return paths

@@ -40,10 +40,10 @@ if TYPE_CHECKING:
     from dbthermal.separation._subspace.method import SubspaceSettings
 
 _UNEXPLAINED: Final = (
-    "The bands of {:.0%} of the pixels with moving reflections do not show the same at the same "
-    "time, and no shift of the reflections explains it. If the cameras stand apart and a pixel "
-    "mirrors several depths, or their clocks differ, the intervals of the other pixels are too "
-    "small."
+    "In {:.0%} of the image parts with moving reflections the bands do not show the same at the same "
+    "time, and no shift of the reflections explains it. If an object is heated in steps, or rows "
+    "or columns have noise in common, the intervals hold; if the cameras stand apart and a pixel "
+    "mirrors several depths, or their clocks differ, those of pixels without a flag are too small."
 )
 _ROUNDS: Final = 3  # in which motion is undone
 _KEPT: Final = 0.9  # share of the pixels without a flag that a mended capture must keep
@@ -207,6 +207,10 @@ def _on_one_clock(
             aligned = alignment.align(capture, clock=names[0])
     except ValueError:  # nothing tells the clocks: the pixels keep the flag
         return unchanged
+    # Nor does one clock show what a delay too short to matter would explain.
+    offsets, std = np.array(aligned.attrs["time_offset"]), aligned.attrs.get("time_offset_std")
+    if np.abs(offsets).max() < _LATE * np.median(np.diff(capture["time"].values)):
+        return unchanged
     aligned = aligned.assign_coords(time=capture["time"])
     # Not if a band lacks more samples than can be bridged: at steps none is interpolated.
     lost = ~schema.measured(_samples.some_pixels(aligned["counts"]))
@@ -215,7 +219,6 @@ def _on_one_clock(
     less = retry[0].asynchronous <= max(_LESS * share, _SOME) and not retry[0].late
     if not less or len(retry[0].doubts) > len(outcome[0].doubts):
         return unchanged
-    offsets, std = np.array(aligned.attrs["time_offset"]), aligned.attrs.get("time_offset_std")
     place = int(np.abs(offsets).argmax())
     certainty = "" if std is None else f", known to {std:.4f} s"
     sentence = f"The clocks differ: band '{names[place]}' was taken {offsets[place]:+.4f} s after "

@@ -309,7 +309,7 @@ CONSTANT = sequence(np.full((1, 1024, 1024), 17000, dtype=np.uint16), "jpegls") 
 test_refused_with_what_to_do = refused(
     lambda folder, name, *content: flir(folder / name, *content),
     [
-        ("a.ats", b"", "readers.tiff"),
+        ("a.ats", b"ATS", "readers.tiff"),
         ("a.mp4", b"\0\0\0\x18ftypmp42", "film: most have 8 bits that are drawn.*gray16le"),
         ("a.seq", b"BM" * 40, "picture: most have 8 bits"),
         ("a.seq", b"", "Empty file"),

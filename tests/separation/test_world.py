@@ -184,6 +184,19 @@ def test_a_short_capture_is_not_said_to_be_apart(seed: int) -> None:
     assert "warnings" not in separation.separate(shorter, rig.response()).attrs
 
 
+@pytest.mark.parametrize("seed", [7, 52])
+def test_a_smooth_object_is_not_said_to_lie_off(seed: int) -> None:
+    """Noise that is alike in both bands by chance is no displacement of their images."""
+    noise = (0.03, 0.1)
+    capture, truth = seen(World(noise=noise, smooth=True), seed)
+    result = separation.separate(capture, simulation.Rig(noise=noise).response())
+    error = (result["object_temperature"] - truth) / result["object_temperature_std"]
+    holds = np.mean(np.abs(error.values)[:, result["status"].values == 0] < 1.96)
+    print(f"{holds:.3f} hold")
+    assert holds >= LEAST
+    assert "warnings" not in result.attrs
+
+
 def test_a_shaking_image_of_33_rows_is_separated() -> None:
     """The last row is read by itself, and shows no motion across it."""
     capture, _ = seen(WORLDS["cameras shake"][0], 1)
