@@ -30,7 +30,7 @@ _QUIET_MEAN: Final = 2.0 * (1.0 - np.exp(-0.5 * ndtri(0.9) ** 2)) / np.sqrt(2.0 
 _GAP: Final = 1.5  # deviation of the weights that fill a gap [pixel]
 PIXELS: Final = 16  # pixels, about, from which noise and step of the counts are estimated
 # Width of the mean over pixels of the noise of resampled counts, and steps in time.
-_AROUND, _STEPS = 5, 700
+_WIDTH, _STEPS = 5, 700
 _AT_ONCE: Final = 2**17  # samples that are compared in one pass, to stay in the cache
 
 _STILLEST: Final = 0.1  # share of the groups of frames with the least motion
@@ -42,7 +42,7 @@ _DENSITY: Final = np.exp(-0.5 * ndtri(0.5 + 0.5 * _RANKS) ** 2) / np.sqrt(2.0 * 
 _MEANS: Final = -2.0 * np.diff(_DENSITY) / np.diff(_RANKS)
 _UNEQUAL: Final = 1.1
 _LARGER: Final = 1.1  # ratio that contradicts a stated noise; of right ones 1.04 in 51 scenes
-_UNLIKE: Final = 20.0  # largest ratio of a motion between bands
+_MOTION_RATIO: Final = 20.0  # largest ratio of a motion between bands
 
 _MARGIN: Final = 1.25  # on the probability of a value, for noise that differs between pixels
 _COARSE: Final = 0.4  # probability of a value above which counts are too coarse to be judged
@@ -60,12 +60,12 @@ def noise(signal: npt.NDArray[Any]) -> Array:
     if not valid.all():  # invalid samples of each pixel go behind the valid ones
         order = np.argsort(~valid, axis=0, kind="stable")
         signal = np.take_along_axis(signal, order, axis=0)
-    second = np.abs(signal[1:-1] - 0.5 * (signal[:-2] + signal[2:]))
-    second.sort(axis=0)  # NaN last
+    differences = np.abs(signal[1:-1] - 0.5 * (signal[:-2] + signal[2:]))
+    differences.sort(axis=0)  # NaN last
     # The smaller four fifths of the changes are free of the object and of passing reflections.
     quiet = np.maximum((_QUIET * (frames - 2)).astype(np.intp), 1)
-    used = np.arange(len(second)).reshape(-1, *(1,) * quiet.ndim) < quiet
-    total = second.sum(axis=0, dtype=np.float64, where=used)
+    mask = np.arange(len(differences)).reshape(-1, *(1,) * quiet.ndim) < quiet
+    total = differences.sum(axis=0, dtype=np.float64, where=mask)
     level = total / quiet / (_QUIET_MEAN * np.sqrt(1.5))
     return np.where(frames < MINIMUM_FRAMES, np.nan, level)
 
@@ -86,12 +86,12 @@ def larger_noise(signals: npt.NDArray[Any], stated: Array) -> Array:
     bands, groups = len(signals), signals.shape[1] // 3
     if _STILLEST * (groups - 4) * signals.shape[2] < _FEWEST_STILL:
         return np.full(bands, np.nan)
-    three = signals[:, : 3 * groups].reshape(bands, groups, 3, -1)
+    trios = signals[:, : 3 * groups].reshape(bands, groups, 3, -1)
     statistics = np.empty((3, bands, groups - 4, signals.shape[2]))
-    step = max(16, _AT_ONCE // three[:, 0].size)
+    step = max(16, _AT_ONCE // trios[:, 0].size)
     for start in range(0, groups - 4, step):
         stop = min(start + step, groups - 4)
-        statistics[:, :, start:stop] = _differences(three[:, start : stop + 4])
+        statistics[:, :, start:stop] = _differences(trios[:, start : stop + 4])
     rapid, change, surroundings = statistics.reshape(3, bands, -1)
     # Select the stillest tenth of the groups by the differences around each group, in all bands:
     # noise within the group keeps its distribution.
@@ -101,28 +101,28 @@ def larger_noise(signals: npt.NDArray[Any], stated: Array) -> Array:
         return np.full(bands, np.nan)
     motion = surroundings / np.median(surroundings[:, valid], axis=1, keepdims=True)
     stillest = np.argpartition(np.where(valid, motion.sum(axis=0), np.inf), number)[:number]
-    still, middle, last = rapid[:, stillest], *(_RANKS[1:] * number).astype(np.intp)
+    still, middle, end = rapid[:, stillest], *(_RANKS[1:] * number).astype(np.intp)
     # Noise from the smaller seven tenths of the magnitudes. It is not proved if it is larger in the
     # next quarter, where rare motion shows first, or in the slopes of neighbouring groups.
     ordered = np.sort(np.abs(still), axis=1)
     noise = ordered[:, :middle].mean(axis=1) / _MEANS[0]
-    beyond = ordered[:, middle:last].mean(axis=1) / _MEANS[1]
+    quarter = ordered[:, middle:end].mean(axis=1) / _MEANS[1]
     slower = np.sort(np.abs(change[:, stillest]), axis=1)[:, :middle].mean(axis=1) / _MEANS[0]
-    inner = still[:, np.all(np.abs(still) < ordered[:, last : last + 1], axis=0)]
+    inner = still[:, np.all(np.abs(still) < ordered[:, end : end + 1], axis=0)]
     # Covariance between the bands below that of motion proves noise.
     shared = np.cov(inner) + 3.0 * np.outer(noise, noise) / np.sqrt(number)
     np.fill_diagonal(shared, np.inf)
-    proved = np.any(shared < (noise**2 - stated**2)[:, np.newaxis] / _UNLIKE, axis=1)
-    alike = (np.maximum(beyond, slower) < _UNEQUAL * noise) & (noise > _LARGER * stated)
-    return np.where(alike & np.any(alike & proved), noise, np.nan)
+    proved = np.any(shared < (noise**2 - stated**2)[:, np.newaxis] / _MOTION_RATIO, axis=1)
+    candidates = (np.maximum(quarter, slower) < _UNEQUAL * noise) & (noise > _LARGER * stated)
+    return np.where(candidates & np.any(candidates & proved), noise, np.nan)
 
 
-def _differences(three: npt.NDArray[Any]) -> tuple[Array, Array, Array]:
+def _differences(trios: npt.NDArray[Any]) -> tuple[Array, Array, Array]:
     """Second differences of groups (band, group, 3, pixel), of their slopes, and surroundings."""
-    inner = three.shape[1] - 4
-    means = three.mean(axis=2)
-    rapid = (three[:, :, 1] - 0.5 * (three[:, :, 0] + three[:, :, 2])) / np.sqrt(1.5)
-    slope = (three[:, :, 2] - three[:, :, 0]) / np.sqrt(2.0)
+    inner = trios.shape[1] - 4
+    means = trios.mean(axis=2)
+    rapid = (trios[:, :, 1] - 0.5 * (trios[:, :, 0] + trios[:, :, 2])) / np.sqrt(1.5)
+    slope = (trios[:, :, 2] - trios[:, :, 0]) / np.sqrt(2.0)
     change = (slope[:, 2:-2] - 0.5 * (slope[:, 1:-3] + slope[:, 3:-1])) / np.sqrt(1.5)
     third = means[:, 4:] - means[:, :-4] - 2.0 * (means[:, 3:-1] - means[:, 1:-3])
     # A step raises the third difference of the means. A mean of three has a third of the noise's
@@ -141,7 +141,7 @@ def resampled_noise(
     roughness = (_roughness(resampled) / usual[:, np.newaxis]).mean(axis=0)
     ratio = np.divide(roughness, stated, out=np.zeros_like(stated), where=stated > 0.0)
     ratio = ratio.reshape(-1, width)
-    mean, share = (uniform_filter(image, _AROUND) for image in (ratio, (ratio > 0.0) * 1.0))
+    mean, share = (uniform_filter(image, _WIDTH) for image in (ratio, (ratio > 0.0) * 1.0))
     return np.asarray(np.divide(mean, share, out=np.ones_like(mean), where=ratio > 0.0).ravel())
 
 
@@ -224,8 +224,8 @@ def heaped(counts: npt.NDArray[Any], valid: Mask, band: Grain, ends: Any = (None
             end, number = end_of(counts, valid, highest=highest, plain=ends[int(highest)])
             (pixels,) = np.nonzero(number >= FEWEST)
             pixels = pixels[number[pixels] < valid[:, pixels].sum(axis=0)]
-            near = near_end(counts[:, pixels], valid[:, pixels], end[pixels], band)
-            result[pixels] |= is_heap(number[pixels], near, band)
+            trials = near_end(counts[:, pixels], valid[:, pixels], end[pixels], band)
+            result[pixels] |= is_heap(number[pixels], trials, band)
     return result
 
 

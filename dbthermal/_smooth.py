@@ -90,12 +90,12 @@ def subspace(
     if order + len(steps) > len(plain):
         message = f"Invalid order {order} with {len(steps)} steps over {len(plain)} frames"
         raise ValueError(f"{message}. Must not be more functions than frames.")
-    together = np.column_stack([plain[:, :1], *steps, plain[:, 1:]])
+    columns = np.column_stack([plain[:, :1], *steps, plain[:, 1:]])
     # QR makes the columns orthonormal, F = Q R; the object's part of Q is F R^-1 with the camera's
     # columns of F set to zero.
-    functions, triangle = np.linalg.qr(together)
-    together[:, 1 : 1 + len(steps)] = 0.0
-    object_part = np.linalg.solve(triangle.T, together.T).T
+    functions, triangle = np.linalg.qr(columns)
+    columns[:, 1 : 1 + len(steps)] = 0.0
+    object_part = np.linalg.solve(triangle.T, columns.T).T
     return Subspace(functions, object_part, len(steps), functions[:, len(steps) + 1 :])
 
 
@@ -147,11 +147,11 @@ def piecewise(
     counts, steps = np.minimum(number, np.diff(edges) - events), camera_steps(segment)
     # A column after another, of which a piece fills a part.
     size = int(counts.sum())
-    together = np.zeros((size + len(steps), time.size))
-    spans = np.empty((len(together), 2), dtype=np.intp)
+    columns = np.zeros((size + len(steps), time.size))
+    spans = np.empty((len(columns), 2), dtype=np.intp)
     chosen, leverage = np.empty((2, time.size, 1))
-    _polynomials(time, edges, counts, together, spans, chosen, leverage)
-    functions = object_part = together.T
+    _polynomials(time, edges, counts, columns, spans, chosen, leverage)
+    functions = object_part = columns.T
     if steps:
         # The pieces' polynomials P are orthonormal: [P, C] = Q R with Q = [P, S], of the camera's
         # steps C. What P leaves of these, C - P P^T C = S R, lies in the pieces with an event. The
@@ -164,15 +164,15 @@ def piecewise(
         remainder = camera[:, span].T - plain @ (plain.T @ camera[:, span].T)
         remainder -= plain @ (plain.T @ remainder)  # once more, against rounding
         basis, triangle = np.linalg.qr(remainder)
-        together[size:, span] = basis.T
-        with_object = together.copy()
+        columns[size:, span] = basis.T
+        with_object = columns.copy()
         with_object[size:] -= np.linalg.solve(triangle.T, camera)
         leverage += chosen * (with_object[size:].T ** 2).sum(axis=1, keepdims=True)
         # Four columns are taken together, from the first one's begin to the last one's end.
-        spans[size:, 0], last = span.start, spans[max(size - 3, 0) :]
-        last[:, 0], last[:, 1] = np.minimum(last[:, 0], span.start), time.size
+        spans[size:, 0], tail = span.start, spans[max(size - 3, 0) :]
+        tail[:, 0], tail[:, 1] = np.minimum(tail[:, 0], span.start), time.size
         object_part = with_object.T
-    return Subspace(functions, object_part, len(together) - 1, rising, spans, leverage)
+    return Subspace(functions, object_part, len(columns) - 1, rising, spans, leverage)
 
 
 @compiled
@@ -214,8 +214,8 @@ def _polynomials(
         # An end of a piece that was chosen from the data raises the leverage, see `CHANGE_POINT`.
         factor = 1.0 + 0.5 * CHANGE_POINT * ends / count
         chosen[start:stop] = factor
-        at, over = time[start:stop], leverage[start:stop, 0]
-        over[:] = 0.0
+        at, total = time[start:stop], leverage[start:stop, 0]
+        total[:] = 0.0
         for degree in range(count):
             polynomial = columns[column + degree, start:stop]
             before = columns[column + max(degree - 1, 0), start:stop]
@@ -223,7 +223,7 @@ def _polynomials(
                 polynomial[t] = (at[t] - middle) * before[t] if degree > 0 else 1.0
             _make_orthonormal(columns[column:], degree, start, stop)
             for t in range(polynomial.size):
-                over[t] += factor * polynomial[t] ** 2
+                total[t] += factor * polynomial[t] ** 2
             spans[column + degree, 0], spans[column + degree, 1] = start, stop
         column += count
 
@@ -292,6 +292,6 @@ def _bridge(film: Any, start: int, stop: int, pixels: Mask, last: Any) -> None:
                 # A curve begins as its first number.
                 first = film[before if before >= 0 else frame, pixel]
                 slope = (np.float64(film[frame, pixel]) - first) / (frame - before)
-                for between in range(before + 1, frame):
-                    film[between, pixel] = slope * (between - before) + first
+                for place in range(before + 1, frame):
+                    film[place, pixel] = slope * (place - before) + first
             last[pixel] = frame

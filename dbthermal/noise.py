@@ -36,9 +36,9 @@ def second_difference(signal: Array, time: npt.ArrayLike) -> Array:
     time = _numbers.real_numbers("time [s]", time, shape=signal.shape[:1])
     schema.require_rising(time, "time", "s")
     # Samples less the line through both neighbours, over the root of the sum of squared weights.
-    before = ((time[2:] - time[1:-1]) / (time[2:] - time[:-2]))[:, np.newaxis]
-    line = before * signal[:-2] + (1.0 - before) * signal[2:]
-    return np.asarray((signal[1:-1] - line) / np.sqrt(1.0 + before**2 + (1.0 - before) ** 2))
+    weight = ((time[2:] - time[1:-1]) / (time[2:] - time[:-2]))[:, np.newaxis]
+    line = weight * signal[:-2] + (1.0 - weight) * signal[2:]
+    return np.asarray((signal[1:-1] - line) / np.sqrt(1.0 + weight**2 + (1.0 - weight) ** 2))
 
 
 def estimate(first: Array, second: Array, time: npt.ArrayLike) -> tuple[float, float]:
@@ -122,8 +122,8 @@ def estimate_bands(signals: Sequence[Array], time: npt.ArrayLike) -> Array:
         return np.array(estimate(signals[0], signals[1], time))
     rough = [np.median(np.abs(second_difference(signal, time))) for signal in signals]
     quiet = int(np.argmin(rough))
-    further = [band for band in range(len(signals)) if band != quiet]
-    pairs = np.array([estimate(signals[quiet], signals[band], time) for band in further])
+    bands = [band for band in range(len(signals)) if band != quiet]
+    pairs = np.array([estimate(signals[quiet], signals[band], time) for band in bands])
     return np.insert(pairs[:, 1], quiet, np.median(pairs[:, 0]))
 
 
@@ -138,8 +138,8 @@ def _trimmed_covariance(first: Array, second: Array) -> tuple[Array, Array, Arra
     correlation = quotient(plus - minus, plus + minus, 0.0)
     distance = first_scaled**2 - 2.0 * correlation * first_scaled * second_scaled + second_scaled**2
     # Squared Mahalanobis distance: (a^2 - 2 r a b + b^2) / (1 - r^2).
-    keep = distance <= _TRIM * (1.0 - correlation**2)
-    count = keep.sum(axis=0) * _TRIMMED_VARIANCE
+    mask = distance <= _TRIM * (1.0 - correlation**2)
+    count = mask.sum(axis=0) * _TRIMMED_VARIANCE
     products = (first * first, first * second, second * second)
-    auto_first, cross, auto_second = ((p * keep).sum(axis=0) / count for p in products)
+    auto_first, cross, auto_second = ((p * mask).sum(axis=0) / count for p in products)
     return auto_first, cross, auto_second

@@ -119,21 +119,18 @@ def seen(world: World, seed: int) -> tuple[xr.Dataset, Array]:
     y, x = np.indices(size)
     time = np.arange(FRAMES) / world.rate
     # The object: two materials, warmed unevenly.
-    wide = np.exp(-np.hypot(y - 0.5 * size[0], x - 0.5 * size[1]) ** 2 / 1000.0)
-    coated = x > 0.55 * size[1] + 3.0 * np.sin(y / 9.0)
-    coated = x >= 40 + MARGIN if world.smooth else coated
+    spot = np.exp(-np.hypot(y - 0.5 * size[0], x - 0.5 * size[1]) / 12.0)
+    coated = x > (39.5 + MARGIN if world.smooth else 0.55 * size[1] + 3.0 * np.sin(y / 9.0))
     texture = gaussian_filter(rng.standard_normal(size), 1.2)
     texture *= world.detail / texture.std()
     emissivity = [
         np.where(coated, right, left) + (1.0 + 0.3 * band) * texture
         for band, (left, right) in enumerate(zip(*world.surface, strict=True))
     ]
-    warmth = gaussian_filter(rng.standard_normal(size), 9.0)
+    warmth = gaussian_filter(spot if world.smooth else rng.standard_normal(size), 9.0)
     warmth = 5.0 + 20.0 * (warmth - warmth.min()) / np.ptp(warmth)
-    warmth = 6.0 + 14.0 * wide if world.smooth else warmth
     rise = 1.0 - np.exp(-2.0 * time / time[-1]) + 0.08 * np.sin(5.0 * time / time[-1])
     truth = ROOM + 1.5 + rise[:, np.newaxis, np.newaxis] * warmth
-    spot = np.exp(-np.hypot(y - 0.5 * size[0], x - 0.5 * size[1]) / 12.0)
     truth += world.lamp * np.sin(0.8 * np.pi * time)[:, np.newaxis, np.newaxis] * spot
     # What it mirrors, and what is behind it.
     before, beyond = list(people(rng, world, 6)), list(people(rng, world, 4))

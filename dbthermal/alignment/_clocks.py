@@ -60,20 +60,20 @@ class Interpolation:
                 # Unknown where a signal steps, and beside a step where the bend overshoots.
                 unknown = steps(before, after)
                 if self.bend[place].any():
-                    four = frames[before - 1 : after + 2]
-                    off = np.tensordot(self.bend[place].astype(four.dtype), four, 1)
-                    out[place] += np.nan_to_num(off)
+                    block = frames[before - 1 : after + 2]
+                    bend = np.tensordot(self.bend[place].astype(block.dtype), block, 1)
+                    out[place] += np.nan_to_num(bend)
                     neighbours = steps(before - 1, before) | steps(after, after + 1)
-                    unknown = unknown | neighbours & (np.abs(off) > self.swing * largest_step)
+                    unknown = unknown | neighbours & (np.abs(bend) > self.swing * largest_step)
                 out[place][unknown] = np.nan
 
     def _step(self, frames: npt.NDArray[Any], before: int, after: int) -> npt.NDArray[Any]:
         """Change between two samples, or its excess over the neighbouring changes, the smaller."""
         change, time = frames[after] - frames[before], self.stamps
         rates = [
-            (frames[late] - frames[early]) / (time[late] - time[early])
-            for early, late in ((before - 1, before), (after, after + 1))
-            if early >= 0 and late < len(frames) and np.isfinite(time[late] - time[early])
+            (frames[end] - frames[start]) / (time[end] - time[start])
+            for start, end in ((before - 1, before), (after, after + 1))
+            if start >= 0 and end < len(frames) and np.isfinite(time[end] - time[start])
         ]
         width = time[after] - time[before]
         neighbours = [np.where(np.isnan(rate), change, rate * width) for rate in rates]
@@ -84,10 +84,10 @@ class Interpolation:
         """Weights (wanted, time) [1] of all frames, with a multiple of the bend; 0 if not valid."""
         weights = bend * self.bend
         weights[:, 1:3] += np.stack([1.0 - self.weight, self.weight], axis=1)
-        wanted, place = np.nonzero(weights * self.valid[:, np.newaxis])
+        row, place = np.nonzero(weights * self.valid[:, np.newaxis])
         frames = np.stack([self.before - 1, self.before, self.after, self.after + 1], axis=1)
         shape = self.valid.size, self.stamps.size
-        return csr_array((weights[wanted, place], (wanted, frames[wanted, place])), shape=shape)
+        return csr_array((weights[row, place], (row, frames[row, place])), shape=shape)
 
     def noise_factors(self) -> tuple[float, float]:
         """Independent noise over that before, of frames and of their second differences [1]."""
@@ -219,9 +219,9 @@ def interpolation(stamps: Array, present: Mask, wanted: Array, segment: Whole) -
     in_a_row = np.pad(joined & (np.diff(usable) == 1), (1, 1))
     four = between & in_a_row[right - 1] & in_a_row[right] & in_a_row[right + 1]
     # Bend: the cubic through four frames in a row (Lagrange), less the line.
-    nodes, itself = times[right[four, np.newaxis] + np.arange(-2, 2)], np.eye(4, dtype=bool)
+    nodes, unit = times[right[four, np.newaxis] + np.arange(-2, 2)], np.eye(4, dtype=bool)
     away, spacing = wanted[four, np.newaxis] - nodes, nodes[:, :, np.newaxis] - nodes[:, np.newaxis]
     bend = np.zeros((wanted.size, 4))
-    bend[four] = np.prod(np.where(itself, 1.0, away[:, np.newaxis] / (spacing + itself)), axis=2)
+    bend[four] = np.prod(np.where(unit, 1.0, away[:, np.newaxis] / (spacing + unit)), axis=2)
     bend[four, 1:3] -= np.stack([1.0 - weight[four], weight[four]], axis=1)
     return Interpolation(usable[right - 1], usable[right], weight, bend, valid, stamps)

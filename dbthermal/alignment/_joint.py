@@ -25,9 +25,9 @@ from dbthermal.alignment._resampling import STEP, on_one_clock
 from dbthermal.schema import Status, warned
 
 _PIXELS, _FRAMES = 20_000, 400  # of the capture of means that gives clocks and shift, at most
-_COMMON: Final = 0.5  # share of a square's pixels that a frame must have
+_COVERAGE: Final = 0.5  # share of a square's pixels that a frame must have
 _ROUNDS, _VAIN = 8, 2  # clocks that are tried, at most, and in a row without improvement
-_LATE: Final = 0.02  # difference below which clocks are the same [frame]
+_TOLERANCE: Final = 0.02  # difference below which clocks are the same [frame]
 _FLAT: Final = 0.125  # least share of a delay that is taken to be seen [1]
 # Uncertainty of the clocks, or difference from a stated offset, that gives a warning [frame].
 _PRECISION: Final = 0.1
@@ -200,8 +200,8 @@ class _Trial:
 def _step(trials: Sequence[_Trial], frame: float) -> tuple[_Trial, float]:
     """Trial with the least delay, and the step of its clocks that removes the delay [s]."""
     best = min(trials, key=lambda trial: abs(trial.delay))
-    alike = [trial for trial in trials if np.array_equal(trial.late_bands, best.late_bands)]
-    distinct = [trial for trial in alike if abs(trial.clock - best.clock) >= _LATE * frame]
+    peers = [trial for trial in trials if np.array_equal(trial.late_bands, best.late_bands)]
+    distinct = [trial for trial in peers if abs(trial.clock - best.clock) >= _TOLERANCE * frame]
     opposite = [trial for trial in distinct if trial.delay * best.delay < 0.0]
     slope = 1.0
     # Newton's steps are short beside noise: from the second on they are a secant's.
@@ -222,7 +222,7 @@ def _next(trials: Sequence[_Trial], frame: float) -> xr.DataArray | None:
         return None
     change = step * best.late_bands
     offset = best.offset.copy(data=best.offset.values + change - change[0])
-    repeated = any(float(abs(offset - trial.offset).max()) < _LATE * frame for trial in trials)
+    repeated = any(float(abs(offset - trial.offset).max()) < _TOLERANCE * frame for trial in trials)
     return None if repeated else offset
 
 
@@ -263,7 +263,7 @@ def _of_squares(corrected: xr.Dataset) -> xr.Dataset:
         changes = quotient(change.reshape(squares).sum(axis=(2, 4)), number, np.nan)
         pixels = measured.reshape(side, width, side).sum(axis=(0, 2))
         levels = np.where(measured, means, 0.0).reshape(squares).sum(axis=(2, 4))
-        common = number > _COMMON * pixels
+        common = number > _COVERAGE * pixels
         film[:, :, row] = np.where(common, changes + quotient(levels, pixels, np.nan), np.nan)
         covered[row] = pixels > 0
         release()
@@ -283,17 +283,17 @@ def _of_means(aligned: xr.Dataset, scale: Scale) -> tuple[xr.Dataset, Scale]:
         return aligned.load(), scale
     counts = aligned.drop_vars(["y", "x"], errors="ignore")["counts"]
     segment = aligned.get("segment", xr.zeros_like(aligned["time"], dtype=np.int32))
-    first = segment.values[np.arange(segment.size) // length * length]
+    labels = segment.values[np.arange(segment.size) // length * length]
     rows = []
     for top in range(counts.sizes["y"]):
         block = counts[:, :, top : top + 1].astype(np.float64)
         # The same samples in all bands, on one side of a shutter event.
-        valid = schema.measured(block).all("band") & (segment == first)
+        valid = schema.measured(block).all("band") & (segment == labels)
         rows.append(block.where(valid).coarsen(time=length, boundary="trim").mean())
     mean = xr.Dataset(
         {
             "counts": xr.concat(rows, "y").astype(np.float32).assign_attrs(counts.attrs),
-            "segment": ("time", first[: rows[0].sizes["time"] * length : length]),
+            "segment": ("time", labels[: rows[0].sizes["time"] * length : length]),
         },
         attrs=aligned.attrs,
     )
@@ -310,15 +310,15 @@ def _enlarged(field: xr.Dataset, aligned: xr.Dataset) -> xr.Dataset:
         return field
     # The centre of a square of n pixels is n - 1 half pixels from that of its first.
     places = (np.indices(shape) - 0.5 * (side - 1)) / side
-    last = np.reshape(field["known"].shape, (2, 1, 1)) - 1
-    squares = tuple(np.minimum(np.indices(shape) // side, last))
+    ends = np.reshape(field["known"].shape, (2, 1, 1)) - 1
+    squares = tuple(np.minimum(np.indices(shape) // side, ends))
     missing = np.isnan(field["shift"].values).any(axis=0)
     nearest = distance_transform_edt(missing, return_distances=False, return_indices=True)
     values = {"known": (field["known"].dims, field["known"].values[squares], field["known"].attrs)}
     for name in ("shift", "shift_std"):
         filled = field[name].values[:, nearest[0], nearest[1]]
         enlarged = [map_coordinates(plane, places, order=1, mode="nearest") for plane in filled]
-        full = np.where(missing[squares], np.nan, side * np.stack(enlarged))
-        values[name] = (field[name].dims, full, field[name].attrs)
+        planes = np.where(missing[squares], np.nan, side * np.stack(enlarged))
+        values[name] = (field[name].dims, planes, field[name].attrs)
     coordinates = {dim: aligned[dim] for dim in ("y", "x") if dim in aligned.coords}
     return xr.Dataset(values, coords={"axis": field["axis"], **coordinates}, attrs=field.attrs)

@@ -30,9 +30,9 @@ _ROUNDS, _ROBUST = 12, 4  # rounds of a field, and of robust weights of whole-pi
 _CONVERGED: Final = 2e-3  # mean change of the field at its end, of coarser pixels larger [pixel]
 # Explained energy, in variances of noise, that chance does not reach at one of many shifts.
 _SIGNIFICANT: Final = 40.0
-_ROUGH: Final = 0.5  # assumed deviation of a whole-pixel match [pixel]
+_MATCH_STD: Final = 0.5  # assumed deviation of a whole-pixel match [pixel]
 # Parts along a side of the image, for a delay's jackknife; pixels that give a movie's noise.
-_PARTS, _NOISE_PIXELS = 6, 256
+_BLOCKS, _NOISE_PIXELS = 6, 256
 # Share of the changes from which one function of time holds all: before lamps 0.99 to 1, before
 # people, hands and fans 0.1 to 0.5, of switched spots up to 0.97.
 _LEADING: Final = 0.98
@@ -65,24 +65,24 @@ class Movies:
         cls, movies: list[Movie], valid: Mask, noise: Array, power: Array, factor: int, whole: float
     ) -> "Movies":
         """Movies of coarser pixels; power of white noise in each function of time, and in all."""
-        mostly = images.binned(valid.astype(np.float64), factor) > 0.5
-        step = max(1, np.count_nonzero(mostly) // _NOISE_PIXELS)
-        sample = tuple(index[::step] for index in np.nonzero(mostly))
+        majority = images.binned(valid.astype(np.float64), factor) > 0.5
+        step = max(1, np.count_nonzero(majority) // _NOISE_PIXELS)
+        sample = tuple(index[::step] for index in np.nonzero(majority))
         if sample[0].size:
             # Interpolated in time, a movie holds less rapid noise than white noise of its size.
             white = np.sqrt(power.mean()) / factor
-            usual = [MAD * np.median(np.abs(movie[sample])) for movie in movies]
-            noise = np.minimum(noise, np.array(usual) / white)
-        first = images.splines(movies[0], BLUR)
+            levels = [MAD * np.median(np.abs(movie[sample])) for movie in movies]
+            noise = np.minimum(noise, np.array(levels) / white)
+        splines = images.splines(movies[0], BLUR)
         targets = [images.blurred(movie, BLUR) for movie in movies[1:]]
         # What a model leaves lies all over the frames; but where one function of time holds the
         # changes, as of a lamp, in this one, and a border of materials bends the field.
-        energy = np.linalg.eigvalsh(np.tensordot(first, first, ((0, 1), (0, 1))))
-        energy -= first[..., 0].size * (noise[0] / factor * _VALUE_NOISE) ** 2
+        energy = np.linalg.eigvalsh(np.tensordot(splines, splines, ((0, 1), (0, 1))))
+        energy -= splines[..., 0].size * (noise[0] / factor * _VALUE_NOISE) ** 2
         lamp = bool(energy.max() > _LEADING * np.maximum(energy, 0.0).sum())
         events = power.reshape(-1, max(1, power.size // EVENT)).sum(axis=0).astype(np.float32)
         outside = 1.0 / events if lamp else np.full_like(events, max(whole / power.sum(), 1.0))
-        return cls(first, targets, mostly, noise / factor, events, outside, lamp, factor)
+        return cls(splines, targets, majority, noise / factor, events, outside, lamp, factor)
 
     def centres(self) -> list[Array]:
         """Rows and columns, of the capture, of the pixels' centres."""
@@ -99,14 +99,14 @@ class Movies:
 
 
 def _whole_pixels(
-    first: Movie, movies: list[Movie], freedom: float, reach: tuple[int, int]
+    reference: Movie, movies: list[Movie], freedom: float, reach: tuple[int, int]
 ) -> tuple[Array, Array]:
     """Whole-pixel shift (2, y, x) that explains most of the movies; weight (y, x), 0 by chance."""
-    height, width = first.shape[:2]
-    padded = np.pad(first, (*((by, by) for by in reach), (0, 0)))
+    height, width = reference.shape[:2]
+    padded = np.pad(reference, (*((by, by) for by in reach), (0, 0)))
     # Energies in variances of noise: movies are in deviations of noise.
     energies = [np.einsum("yxt,yxt->yx", film, film) for film in (padded, *movies)]
-    best, where = np.zeros((height, width)), np.zeros((2, height, width))
+    best, place = np.zeros((height, width)), np.zeros((2, height, width))
     for down in range(2 * reach[0] + 1):  # a row's pairs of pixels at once
         rows = slice(down, down + height)
         gain = np.zeros((height, width, 2 * reach[1] + 1))
@@ -117,25 +117,25 @@ def _whole_pixels(
         shifted = [energies[0][rows, right : right + width] for right in range(gain.shape[2])]
         gain /= np.maximum(images.blurred(np.stack(shifted, axis=-1), WINDOW), freedom)
         if down == reach[0]:
-            still = gain[..., reach[1]]
+            origin = gain[..., reach[1]]
         right, highest = gain.argmax(axis=2), gain.max(axis=2)
         better = highest > best
-        best[better], where[0][better], where[1][better] = highest[better], down, right[better]
+        best[better], place[0][better], place[1][better] = highest[better], down, right[better]
     # Products of two blurred noises are alike over an area of 2 pi BLUR^2.
     chance = _SIGNIFICANT * 2.0 * np.pi * BLUR**2 / (4.0 * np.pi * WINDOW**2)
-    unmoved = best - still <= chance
-    where[:, unmoved] = np.reshape(reach, (2, 1))
-    best = np.where(unmoved, _UNMOVED * still, best - still)
+    unmoved = best - origin <= chance
+    place[:, unmoved] = np.reshape(reach, (2, 1))
+    best = np.where(unmoved, _UNMOVED * origin, best - origin)
     # Weight: share of the movies' energy in a window that is explained.
     share = best / np.maximum(images.blurred(np.sum(energies[1:], axis=0), WINDOW), 1e-9)
-    return where - np.reshape(reach, (2, 1, 1)), np.where(best > chance, share, 0.0)
+    return place - np.reshape(reach, (2, 1, 1)), np.where(best > chance, share, 0.0)
 
 
 def on_valid(places: Array, valid: Mask) -> Mask:
     """Places (2, ...) that lie on valid pixels of an image."""
-    near = np.rint(places)
-    result = np.all([(n >= 0) & (n < size) for n, size in zip(near, valid.shape, strict=True)], 0)
-    row, column = np.where(result, near, 0).astype(np.intp)
+    grid = np.rint(places)
+    result = np.all([(n >= 0) & (n < size) for n, size in zip(grid, valid.shape, strict=True)], 0)
+    row, column = np.where(result, grid, 0).astype(np.intp)
     return np.asarray(result & valid[row, column])
 
 
@@ -159,12 +159,12 @@ def _information(
     of a misfit weighed less. Second, the misfit of the residual (movie, y, x, event), over noise
     and a tolerated share of what is reflected.
     """
-    places, used = movies.pairs(shift)
+    places, mask = movies.pairs(shift)
     noise = movies.noise[0] * _VALUE_NOISE
-    total = np.zeros((*used.shape, 6))
+    total = np.zeros((*mask.shape, 6))
     window = partial(images.blurred, width=WINDOW)
-    numbers = np.maximum(window(used * np.float32(1.0)), 1e-9)[..., np.newaxis] * movies.freedom
-    weights = np.where(used[..., np.newaxis], misfits**-_EXCLUDED, np.float32(0.0))
+    numbers = np.maximum(window(mask * np.float32(1.0)), 1e-9)[..., np.newaxis] * movies.freedom
+    weights = np.where(mask[..., np.newaxis], misfits**-_EXCLUDED, np.float32(0.0))
     moments, events = images.products(movies.first, movies.targets, places, weights)
     updated = np.empty_like(misfits)
     for place, level in enumerate(movies.noise[1:]):
@@ -185,7 +185,7 @@ def _information(
         local, square, scale = np.array([ratio + share * along, ratio**2, white], "f4")[..., None]
         first, product, second = np.moveaxis(events[place], 2, 0)
         excess, reflected = (
-            images.blurred(used[..., np.newaxis] * energy, WINDOW) / scale - numbers
+            images.blurred(mask[..., np.newaxis] * energy, WINDOW) / scale - numbers
             for energy in (second - 2.0 * local * product + local**2 * first, square * first)
         )
         # What the object does at the same time is in the residual of few events.
@@ -202,15 +202,15 @@ def _information(
             yh - ratio * my - share * my * along - yy * moved[0] - yx * moved[1],
             xh - ratio * mx - share * mx * along - yx * moved[0] - xx * moved[1],
         )
-        less = ratio * freedom * (movies.noise[0] * _SLOPE_NOISE) ** 2
-        squares = ratio * yy - less, ratio * yx, ratio * xx - less
-        weight = (used * ratio / (usual * variance))[..., np.newaxis]
-        total += weight * np.stack([*squares, *steps, less], axis=-1)
+        bias = ratio * freedom * (movies.noise[0] * _SLOPE_NOISE) ** 2
+        squares = ratio * yy - bias, ratio * yx, ratio * xx - bias
+        weight = (mask * ratio / (usual * variance))[..., np.newaxis]
+        total += weight * np.stack([*squares, *steps, bias], axis=-1)
     total = np.moveaxis(images.blurred(total, WINDOW), 2, 0)
-    tensor, gradient, less = total[:3], total[3:5], total[5]
+    tensor, gradient, bias = total[:3], total[3:5], total[5]
     # With noise N in the slopes, var = (A + N) / A^2: as if the information were A^2 / (A + N).
     size = tensor[0] + tensor[2]
-    share = np.maximum(size, 0.0) / np.maximum(size + less, 1e-300)
+    share = np.maximum(size, 0.0) / np.maximum(size + bias, 1e-300)
     tensor, gradient = _positive(tensor) * share, gradient * share
     return Information(tensor / movies.factor**2, gradient / movies.factor), updated
 
@@ -235,25 +235,25 @@ def start(movies: Movies, planes: list[Movie], spline: Spline) -> Field | None:
     reach = movies.valid.shape[0] // 3, movies.valid.shape[1] // 3
     levels = (movies.noise * _VALUE_NOISE).astype(np.float32)
     pictures = [images.blurred(x, BLUR) / level for x, level in zip(planes, levels, strict=True)]
-    rough, share = _whole_pixels(pictures[0], pictures[1:], float(movies.freedom.sum()), reach)
+    shift, share = _whole_pixels(pictures[0], pictures[1:], float(movies.freedom.sum()), reach)
     share *= movies.valid
     if not share.any():
         return None
-    at_end = np.any(np.abs(rough) == np.reshape(reach, (2, 1, 1)), axis=0)
+    at_end = np.any(np.abs(shift) == np.reshape(reach, (2, 1, 1)), axis=0)
     if np.sum(share * at_end) > 0.5 * np.sum(share):
         raise ValueError(
             f"Invalid shift of the reflections: most match best {reach[0] * movies.factor} rows or "
             f"{reach[1] * movies.factor} columns away, the end of the search. Must be less than a "
             "third of the image."
         )
-    target, weight = rough * movies.factor, share / (_ROUGH * movies.factor) ** 2
+    target, weight = shift * movies.factor, share / (_MATCH_STD * movies.factor) ** 2
     centres, zero = movies.centres(), np.zeros_like(share)
-    field, kept, step = None, weight, target
+    field, precision, step = None, weight, target
     for _ in range(1 + _ROBUST):
-        data = Information(np.stack([kept, zero, kept]), kept * step)
+        data = Information(np.stack([precision, zero, precision]), precision * step)
         field = spline.fitted(data, centres, field)
         step = target - field.on(centres)
-        kept = weight / (1.0 + np.sum(step**2, axis=0) / movies.factor**2) ** 2
+        precision = weight / (1.0 + np.sum(step**2, axis=0) / movies.factor**2) ** 2
     return field
 
 
@@ -297,33 +297,33 @@ def delay(movies: Movies, rate: Movie, shift: Array, misfits: Movie) -> tuple[fl
     Third, the energy (2, y, x) of the others that the moved movie explains, and all their energy
     beside noise, in variances of noise.
     """
-    places, used = movies.pairs(shift)
-    weights = np.where(used[..., np.newaxis], 1.0 / misfits, np.float32(0.0))
+    places, mask = movies.pairs(shift)
+    weights = np.where(mask[..., np.newaxis], 1.0 / misfits, np.float32(0.0))
     moments, _ = images.products(movies.first, movies.targets, places, weights, rate)
     totals = np.zeros((4, *movies.valid.shape))
     for array, weight, level in zip(moments, weights, movies.noise[1:], strict=True):
         windows = images.blurred(array, WINDOW)
         freedom = images.blurred(weight @ movies.freedom, WINDOW)
         # Noise of the slopes and of the moved movie.
-        less = freedom[..., np.newaxis] * movies.noise[0] ** 2
-        less = less * np.square([_VALUE_NOISE, _SLOPE_NOISE, _SLOPE_NOISE, 0.0])
-        equations = images.normal_equations(windows, less)
+        bias = freedom[..., np.newaxis] * movies.noise[0] ** 2
+        bias = bias * np.square([_VALUE_NOISE, _SLOPE_NOISE, _SLOPE_NOISE, 0.0])
+        equations = images.normal_equations(windows, bias)
         # The shift of each window is eliminated.
         tensor, cross = equations[..., :2, :2], equations[..., :2, 2]
         ridge = _RIDGE * np.trace(tensor, axis1=-2, axis2=-1).max()
         share = np.linalg.solve(tensor + ridge * np.eye(2), cross[..., np.newaxis])[..., 0]
         late = equations[..., 3, 2] - np.sum(share * equations[..., 3, :2], axis=-1)
-        seen = equations[..., 2, 2] - np.sum(share * cross, axis=-1)
-        moved, common, second = (windows[..., place] for place in (0, 4, 14))
-        second = second - freedom * (level * _VALUE_NOISE) ** 2
-        alike = np.maximum(common, 0.0) ** 2 / np.maximum(moved, np.finfo(np.float64).tiny)
-        totals += np.where(used, np.stack([late, seen, alike, second]), 0.0) / level**2
+        precision = equations[..., 2, 2] - np.sum(share * cross, axis=-1)
+        moved, common, power = (windows[..., place] for place in (0, 4, 14))
+        power = power - freedom * (level * _VALUE_NOISE) ** 2
+        gain = np.maximum(common, 0.0) ** 2 / np.maximum(moved, np.finfo(np.float64).tiny)
+        totals += np.where(mask, np.stack([late, precision, gain, power]), 0.0) / level**2
     gradient, information, *energy = totals
-    starts = [np.arange(_PARTS) * size // _PARTS for size in movies.valid.shape]
+    starts = [np.arange(_BLOCKS) * size // _BLOCKS for size in movies.valid.shape]
     # Jackknife over parts of the image: windows of several depths differ by far more than noise.
-    of_parts = np.add.reduceat(np.add.reduceat(totals[:2], starts[0], axis=1), starts[1], axis=2)
+    blocks = np.add.reduceat(np.add.reduceat(totals[:2], starts[0], axis=1), starts[1], axis=2)
     with np.errstate(divide="ignore", invalid="ignore"):  # one part may tell all: no deviation
-        without = (gradient.sum() - of_parts[0]) / (information.sum() - of_parts[1])
-    std = np.sqrt((without.size - 1) * np.var(without))
+        replicates = (gradient.sum() - blocks[0]) / (information.sum() - blocks[1])
+    std = np.sqrt((replicates.size - 1) * np.var(replicates))
     late = float(gradient.sum() / information.sum())
     return late, float(std), np.stack(energy)

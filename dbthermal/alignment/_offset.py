@@ -36,7 +36,7 @@ _PIXELS, _SAMPLES = 16384, 2**25  # compared pixels, and samples of a band, at m
 SEARCH: Final = 5  # largest lag that is searched by default, either way [frame]
 # Step of one clock against the other from which a lost frame or a set clock is suspected [frame].
 _CLOCK_STEP: Final = 0.5
-_COMMON: Final = 0.5  # least share of the frames that both bands must have [1]
+_COVERAGE: Final = 0.5  # least share of the frames that both bands must have [1]
 _MINIMUM_FRAMES: Final = 32  # fewest frames from which an offset is estimated
 _GROUPS: Final = 16  # groups of pixels of the jackknife
 _SIGNIFICANCE: Final = 6.0  # least covariance of the bands [standard deviation]
@@ -45,7 +45,7 @@ _ORDER: Final = 8  # smooth functions that are projected out
 TELLING: Final = 2**22  # samples of a band from which the share of a bend is estimated, at most
 # Largest share of the cubic's bend, and its largest standard deviation (1.0 to 1.5 +- 0.12 half a
 # frame late); and the difference of frame rates below which neighbouring frames compare [1].
-_MOST_BENT, _VAGUE, _ALIKE = 2.0, 0.25, 0.01
+_MAX_BEND, _MAX_STD, _RATE_ERROR = 2.0, 0.25, 0.01
 
 
 @dataclass(frozen=True)
@@ -136,11 +136,11 @@ def require_one_clock(
         return
     place = int(np.argmax(np.abs(slip)))
     excess = steps[:, place] - np.median(steps, axis=1)
-    band, last = int(np.argmax(np.abs(excess))), int(rows[place])
+    band, frame = int(np.argmax(np.abs(excess))), int(rows[place])
     # Offsets before the step, after it, and after it with the step undone. A clock was set if the
     # last is nearer to the first, frames were lost if the second is.
     before, after, undone = (stamps.copy() for _ in range(3))
-    before[band, last + 1 :] = after[band, : last + 1] = undone[band, : last + 1] = np.nan
+    before[band, frame + 1 :] = after[band, : frame + 1] = undone[band, : frame + 1] = np.nan
     undone[band] -= excess[band]
     trials = before, after, undone
     reference, stepped, without = (_try(pair, signals, times, search) for times in trials)
@@ -148,7 +148,7 @@ def require_one_clock(
     if abs(without - reference) < np.nan_to_num(abs(stepped - reference), nan=np.inf):
         raise ValueError(
             f"Invalid exposure times of band '{pair['band'].values[band]}': a step of "
-            f"{steps[band, place]:.6g} s after {stamps[band, last]:.6g} s, but the images go on "
+            f"{steps[band, place]:.6g} s after {stamps[band, frame]:.6g} s, but the images go on "
             "as without it. Must be of a clock that is not set while it runs; give the capture "
             "before or after."
         )
@@ -268,31 +268,31 @@ def _covariances(shared: _Pair, search: int, names: list[str]) -> tuple[Array, A
     """Covariances of rapid changes by group: C (group, lag); R (group, 2) of the first band."""
     # One step at a shutter event of either band, the same for both.
     _, segment = np.unique(shared.segments, axis=1, return_inverse=True)
-    common = _common(shared, names)
-    first, second = (_rapid(movie, shared.times, common, segment) for movie in shared.signals)
+    frames = _common(shared, names)
+    first, second = (_rapid(movie, shared.times, frames, segment) for movie in shared.signals)
     # The first band is later by up to `search` lags, and two more that `_delays` needs, either way.
-    cross = [_lagged(first, second, common, lag) for lag in range(-search - 2, search + 3)]
-    auto = [_lagged(first, first, common, lag) for lag in (1, 2)]
+    cross = [_lagged(first, second, frames, lag) for lag in range(-search - 2, search + 3)]
+    auto = [_lagged(first, first, frames, lag) for lag in (1, 2)]
     return np.stack(cross, axis=1), np.stack(auto, axis=1)
 
 
 def _common(shared: _Pair, names: list[str]) -> Mask:
     """Frames (time) that both bands have, over which the smooth part is removed from both."""
     valid = np.stack([present(movie) for movie in shared.signals])
-    common, either = valid.all(axis=0), valid.any(axis=0).sum()
-    if common.sum() < _COMMON * either:
-        lacking = int(np.argmin(valid.sum(axis=1)))
-        share = 1.0 - valid[lacking].sum() / either
+    frames, total = valid.all(axis=0), valid.any(axis=0).sum()
+    if frames.sum() < _COVERAGE * total:
+        band = int(np.argmin(valid.sum(axis=1)))
+        share = 1.0 - valid[band].sum() / total
         raise ValueError(
-            f"Invalid frames of band '{names[lacking]}': {100 * share:.0f} % are missing, and the "
-            f"bands '{names[0]}' and '{names[1]}' share {100 * common.sum() / either:.0f} %. Must "
-            f"share at least {100 * _COMMON:.0f} %, for a time offset; give the offset."
+            f"Invalid frames of band '{names[band]}': {100 * share:.0f} % are missing, and the "
+            f"bands '{names[0]}' and '{names[1]}' share {100 * frames.sum() / total:.0f} %. Must "
+            f"share at least {100 * _COVERAGE:.0f} %, for a time offset; give the offset."
         )
-    if common.sum() < _MINIMUM_FRAMES:
-        label = f"{common.sum()} of valid frames of both bands '{names[0]}' and '{names[1]}'"
+    if frames.sum() < _MINIMUM_FRAMES:
+        label = f"{frames.sum()} of valid frames of both bands '{names[0]}' and '{names[1]}'"
         rule = f"Must be at least {_MINIMUM_FRAMES} for a time offset"
         raise ValueError(f"Invalid number {label}. {rule}.")
-    return np.asarray(common)
+    return np.asarray(frames)
 
 
 def _rapid(movie: Array, times: Array, valid: Mask, segment: smooth.Whole) -> Array:
@@ -336,13 +336,13 @@ def _peak(cross: Array, label: str) -> int:
 def _delays(cross: Array, auto: Array) -> Array:
     """Sub-frame offsets (group, 2) [frame], if they lie in (-1, 0), and if in (0, 1)."""
     # First row: all groups of pixels; each other row omits a group, for the jackknife.
-    kept, middle = np.vstack([np.ones(_GROUPS), 1.0 - np.eye(_GROUPS)]), cross.shape[1] // 2
-    cross, (near, far) = kept @ cross, (kept @ auto).T
+    groups, middle = np.vstack([np.ones(_GROUPS), 1.0 - np.eye(_GROUPS)]), cross.shape[1] // 2
+    cross, (auto1, auto2) = groups @ cross, (groups @ auto).T
     delays = []
     for lag in (-1, 0):
         # C_-1 -+ C_2 = (h0 -+ h1)(R1 -+ R2) of the frames m - 1 and m + 2: delta = h1 / (h0 + h1).
         before, after = cross[:, middle + lag - 1], cross[:, middle + lag + 2]
-        share = 0.5 - 0.5 * (before - after) / (near - far) * (near + far) / (before + after)
+        share = 0.5 - 0.5 * (before - after) / (auto1 - auto2) * (auto1 + auto2) / (before + after)
         delays.append(lag + share)
     return np.stack(delays, axis=1)
 
@@ -363,8 +363,8 @@ def bent(
     """
     timed, valid = present(pair[1]) & np.isfinite(plan.stamps), plan.valid & present(pair[0])
     shared, rate = present(pair[0]) & timed, clocks.frame_period(plan.stamps)
-    alike = abs(clocks.frame_period(times) - rate) < _ALIKE * rate
-    if not (alike and plan.bend.any() and min(valid.sum(), timed.sum()) >= _MINIMUM_FRAMES):
+    agreement = abs(clocks.frame_period(times) - rate) < _RATE_ERROR * rate
+    if not (agreement and plan.bend.any() and min(valid.sum(), timed.sum()) >= _MINIMUM_FRAMES):
         return plan
     try:
         power = np.square(noises.estimate(pair[0, shared], pair[1, shared], times[shared]))
@@ -375,7 +375,7 @@ def bent(
     films = pair[0], *(matrix @ np.nan_to_num(pair[1]) for matrix in matrices)
     y, line, x = (_rapid(film, times, valid, segment) for film in films)
     replace(plan, swing=np.inf).apply(pair[1], film := np.empty_like(y), largest)
-    used = np.isfinite(film)
+    mask = np.isfinite(film)
     # Without the smooth functions white noise adds -_ORDER / n of its variance to the products of
     # neighbouring frames: it is taken out.
     pairs = (y, valid), (_rapid(pair[1], plan.stamps, timed, segment), timed)
@@ -384,16 +384,16 @@ def bent(
     late, early = dot(y[1:], x[:-1]), dot(y[:-1], x[1:])
     # Interpolated frames vary less: scale their products, alike in all pixels, to the samples'.
     cross = 0.5 * (late + early) * np.sqrt(np.sum(auto_y * auto_x) / np.sum(late * early))
-    white, forces = used.sum(axis=0) * (1.0 - _ORDER / valid.sum()), []
+    white, forces = mask.sum(axis=0) * (1.0 - _ORDER / valid.sum()), []
     for film, matrix in zip((line, x), matrices, strict=True):
-        common, noisy = dot(y, film * used), (matrix**2).sum() / valid.sum() * white * power[1]
-        force = power[0] * (common * auto_x - (dot(film, film * used) - noisy) * cross)
-        level = (dot(y, y * used) - white * power[0]) * cross - common * auto_y
+        common, noisy = dot(y, film * mask), (matrix**2).sum() / valid.sum() * white * power[1]
+        force = power[0] * (common * auto_x - (dot(film, film * mask) - noisy) * cross)
+        level = (dot(y, y * mask) - white * power[0]) * cross - common * auto_y
         force += power[1] * cross.sum() / auto_x.sum() * level
         forces.append([group.sum() for group in np.array_split(force, _GROUPS)])
     # The share at which no force is left, from the line (0) to the cubic (1); jackknife as above.
     before, after = forces @ np.column_stack([np.ones(_GROUPS), 1.0 - np.eye(_GROUPS)])
-    share, *without = before / (before - after)
-    if np.sqrt((_GROUPS - 1) * np.var(without)) <= _VAGUE and 0.0 <= share <= _MOST_BENT:
+    share, *replicates = before / (before - after)
+    if np.sqrt((_GROUPS - 1) * np.var(replicates)) <= _MAX_STD and 0.0 <= share <= _MAX_BEND:
         return replace(plan, bend=share * plan.bend)
     return plan

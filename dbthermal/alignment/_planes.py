@@ -38,12 +38,12 @@ EVENT: Final = 4  # functions of time of an event, that a field weighs alike
 _FRAMES, _ALONG, _SIDES = 400, 8, (8, 16)
 _BLUR: Final = 2.0  # before a displacement is looked for [pixel]
 # Chance below which, and pixels or frames from which, so many windows or more are displaced.
-_CHANCE, _LEAST, _LEAST_LATE, _FEWEST = 1e-3, 0.3, 0.1, 4
+_CHANCE, _SHIFT, _DELAY, _FEWEST = 1e-3, 0.3, 0.1, 4
 # Share of a band's changes that the other does not explain. Of displaced cameras whose shift the
 # step does not see: 0.016 to 0.85, in all of 13 scenes above this; at one place 0 to 0.016 in 66 of
 # 72, at most 0.066. A search in vain costs time alone.
 _UNEXPLAINED: Final = 0.015
-_STRONG: Final = 3.0  # variance of a window's changes over the noise
+_CONTRAST: Final = 3.0  # variance of a window's changes over the noise
 # Functions of time, of a smooth object at most, and of what changes rapidly; pixels that tell them.
 _ORDER, _RAPID_PLANES, _RAPID_PIXELS = 14, 32, 100
 _COMMON_SAMPLES: Final = 0.9  # least share of a pixel's samples, over the largest such share
@@ -165,11 +165,11 @@ class Capture:
         valid, blocks = self.valid.copy(), []
         for rows, films, complete in self.blocks(max(1, _ROWS // factor) * factor):
             valid[rows] &= complete
-            used = valid[rows, :, np.newaxis]
-            share = np.maximum(images.binned(used.astype(np.float64), factor), factor**-2)
+            mask = valid[rows, :, np.newaxis]
+            share = np.maximum(images.binned(mask.astype(np.float64), factor), factor**-2)
             signals = [np.moveaxis(film, 0, -1) for film in films]
-            if not used.all():
-                signals = [np.where(used, signal, np.float32(0.0)) for signal in signals]
+            if not mask.all():
+                signals = [np.where(mask, signal, np.float32(0.0)) for signal in signals]
             scale = (self.slopes[:, None, None, None] * share).astype(np.float32)
             blocks.append(np.stack([images.binned(signal, factor) for signal in signals]) / scale)
         return list(np.concatenate(blocks, axis=1)), valid
@@ -204,13 +204,13 @@ def _frames(counts: xr.DataArray) -> npt.NDArray[np.intp]:
     """Frames in which most of the pixels that every band ever measures are measured."""
     step = stride(counts.shape[2:], _PIXELS)
     valid = schema.measured(counts[:, :, ::step, ::step].values)
-    ever = valid.any(axis=1).all(axis=0)  # a view may show the object alone
-    share = valid[..., ever].mean(axis=2).min(axis=0) if ever.any() else np.zeros(valid.shape[1])
-    used = np.flatnonzero(share > _COMMON)
-    if used.size < noises.MINIMUM_FRAMES:
+    view = valid.any(axis=1).all(axis=0)  # a view may show the object alone
+    share = valid[..., view].mean(axis=2).min(axis=0) if view.any() else np.zeros(valid.shape[1])
+    frames = np.flatnonzero(share > _COMMON)
+    if frames.size < noises.MINIMUM_FRAMES:
         rule = f"Must be at least {noises.MINIMUM_FRAMES}"
-        raise ValueError(f"Invalid number {used.size} of frames that all bands have. {rule}.")
-    return used
+        raise ValueError(f"Invalid number {frames.size} of frames that all bands have. {rule}.")
+    return frames
 
 
 def displaced_windows(corrected: xr.Dataset, scale: Scale) -> tuple[bool, float]:
@@ -241,18 +241,18 @@ def displaced_windows(corrected: xr.Dataset, scale: Scale) -> tuple[bool, float]
 
 def _share(windows: Array) -> float:
     """Share of windows whose bands are apart, from normal equations A d = g (window, 4, 3)."""
-    number, whole, size = len(windows), windows.sum(axis=0), windows.shape[2]
+    number, total, size = len(windows), windows.sum(axis=0), windows.shape[2]
     # All windows, and all but each window in turn, must determine a displacement.
-    sums = np.concatenate([whole[np.newaxis], whole - windows])
+    sums = np.concatenate([total[np.newaxis], total - windows])
     if number < _FEWEST or np.linalg.eigvalsh(sums[:, :size]).min() <= 0.0:
         return 0.0
-    shift, *without = np.linalg.solve(sums[:, :size], sums[:, size, :, np.newaxis])[..., 0]
-    covariance = (number - 1) ** 2 / number * np.cov(np.transpose(without))
+    shift, *replicates = np.linalg.solve(sums[:, :size], sums[:, size, :, np.newaxis])[..., 0]
+    covariance = (number - 1) ** 2 / number * np.cov(np.transpose(replicates))
     square, free = shift @ np.linalg.solve(covariance, shift), number - size
     chance = fdtrc(size, free, free / (number - 1) / size * square)
-    in_image = np.linalg.solve(whole[:2, :2], whole[size, :2])
-    in_time = whole[size, 2] / whole[2, 2]
-    if chance > _CHANCE or (np.hypot(*in_image) < _LEAST and abs(in_time) < _LEAST_LATE):
+    in_image = np.linalg.solve(total[:2, :2], total[size, :2])
+    in_time = total[size, 2] / total[2, 2]
+    if chance > _CHANCE or (np.hypot(*in_image) < _SHIFT and abs(in_time) < _DELAY):
         return 0.0
     # Windows whose residual is smaller with it: 2 d g - d A d > 0.
     return float(np.mean((2.0 * windows[:, size] - windows[:, :size] @ shift) @ shift > 0.0))
@@ -277,9 +277,9 @@ def _window_equations(corrected: xr.Dataset, scale: Scale) -> Iterator[tuple[Arr
         film[:, ~schema.measured(film).all(axis=0)] = np.nan  # the same samples in both bands
         flat = film.reshape(2, time.size, -1)
         (first, share), (second, _) = (bridged(block) for block in flat)
-        used = share > _COMMON_SAMPLES * share.max()
-        whole = np.where(used, np.stack([first, second]), np.float32(0.0))
-        return np.asarray(whole.reshape(film.shape) / slopes, np.float32)
+        mask = share > _COMMON_SAMPLES * share.max()
+        result = np.where(mask, np.stack([first, second]), np.float32(0.0))
+        return np.asarray(result.reshape(film.shape) / slopes, np.float32)
 
     # Functions of time of what changes rapidly in the quietest band.
     height, width = rows.stop - rows.start, columns.stop - columns.start
@@ -306,16 +306,16 @@ def _window_equations(corrected: xr.Dataset, scale: Scale) -> Iterator[tuple[Arr
             planes = film.reshape(2, time.size, -1).mT @ function.astype(np.float32)
             planes = planes.reshape(2, *film.shape[2:], -1)
             first, second = images.splines(planes[0], _BLUR), images.blurred(planes[1], _BLUR)
-            even, steps = np.ones((1, *places.shape[1:], 1), np.float32), rate.astype(np.float32)
-            pairs = images.products(first, [second], places, even, steps)[0][0].sum(axis=0)
-            within = (slice(start, start + side) for start in lefts - columns.start)
-            block.extend(pairs[window].sum(axis=0) for window in within)
+            weights, steps = np.ones((1, *places.shape[1:], 1), np.float32), rate.astype(np.float32)
+            pairs = images.products(first, [second], places, weights, steps)[0][0].sum(axis=0)
+            slices = (slice(start, start + side) for start in lefts - columns.start)
+            block.extend(pairs[window].sum(axis=0) for window in slices)
     # Noise of variance s^2, blurred by b: s^2 / (4 pi b^2), of a slope 1 / (2 b^2) of that.
     levels, slope = side**2 * noise[bands] ** 2 / (4.0 * np.pi * _BLUR**2), 0.5 / _BLUR**2
     for windows, rate in zip(sums, rates, strict=True):
         squares = np.array([len(rate), len(rate) * slope, len(rate) * slope, np.sum(rate**2)])
         squares *= levels[0]
-        strong = [window for window in windows if window[0] > (_STRONG + 1.0) * squares[0]]
+        strong = [window for window in windows if window[0] > (_CONTRAST + 1.0) * squares[0]]
         pairs = np.reshape(strong, (-1, 15))
         energies = np.sum(pairs[:, 14] - len(rate) * levels[1])
         explained = np.sum(np.maximum(pairs[:, 4], 0.0) ** 2 / (pairs[:, 0] - squares[0]))
@@ -325,8 +325,8 @@ def _window_equations(corrected: xr.Dataset, scale: Scale) -> Iterator[tuple[Arr
 
 def _measured(corrected: xr.Dataset) -> tuple[slice, slice]:
     """Rows and columns with samples in some frames, as of an object in a part of the image."""
-    every = slice(None, None, max(1, corrected.sizes["time"] // _ALONG))
-    seen = schema.measured(corrected["counts"].isel(time=every).values).all(axis=0).any(axis=0)
-    seen |= not seen.any()
-    rows, columns = (np.flatnonzero(seen.any(axis=axis)) for axis in (1, 0))
+    frames = slice(None, None, max(1, corrected.sizes["time"] // _ALONG))
+    pixels = schema.measured(corrected["counts"].isel(time=frames).values).all(axis=0).any(axis=0)
+    pixels |= not pixels.any()
+    rows, columns = (np.flatnonzero(pixels.any(axis=axis)) for axis in (1, 0))
     return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)

@@ -20,16 +20,16 @@ _COARSE: Final = 28  # pixels along the shorter side of the coarsest image, at l
 # Periods [frame] of which slower changes are left out. A longer one is taken whose field has so
 # many times smaller deviations where the shorter one is known.
 _PERIODS: Final = (5.0, 10.0, 20.0, 80.0)
-_MORE: Final = 1.25
-_KNOWN: Final = 0.2  # largest deviation of a shift by the data of a window alone [pixel]
-_WIDE: Final = 6.0  # deviation of the window in which a field and its data are compared [pixel]
+_IMPROVEMENT: Final = 1.25
+_PRECISION: Final = 0.2  # largest deviation of a shift by the data of a window alone [pixel]
+_WINDOW: Final = 6.0  # deviation of the window in which a field and its data are compared [pixel]
 _RIDGE: Final = 1e-6  # of the largest information, added for windows without any
 # Shift from which the cameras see reflections apart: in standard deviations, and in pixels.
 _SIGMAS, _LEAST_SHIFT = 3.0, 0.1
 # Share of what no shift leaves that a shift must explain: seen 0.13 or more; below 0.06 of clouds
 # and heat. And share of all: 0.0013 of clouds without texture, 0.0035 to 0.027 of lamps.
 _EXPLAINED, _LEAST_GAIN = 0.1, 0.0025
-_NEAR: Final = 0.125  # of the image's smaller side, by which a field is extrapolated
+_EXTENT: Final = 0.125  # of the image's smaller side, by which a field is extrapolated
 
 
 def reflection_shift(corrected: xr.Dataset, response: xr.Dataset) -> xr.Dataset:
@@ -141,7 +141,7 @@ def _coarse(capture: Capture, spline: Spline, factor: int) -> tuple[Capture, Mov
         resolved = _resolved(data, factor)
         size = 0.25 * np.log(_variances(field, level, data)).sum(axis=0)
         gain = np.inf if result is None else np.mean((sizes - size)[earlier])
-        if resolved.any() and gain > np.log(_MORE):
+        if resolved.any() and gain > np.log(_IMPROVEMENT):
             earlier, sizes = resolved, size
             result = (replace(capture, valid=valid), functions, white, field)
     if result is None:
@@ -155,7 +155,7 @@ def _coarse(capture: Capture, spline: Spline, factor: int) -> tuple[Capture, Mov
 def _resolved(data: Information, factor: int = 1) -> Mask:
     """Pixels (y, x) where the data of a window alone tell the shift in one direction."""
     area = 4.0 * np.pi * (matching.WINDOW * factor) ** 2
-    return np.asarray(area * matching.eigenvalues(data.tensor)[0] > 1.0 / _KNOWN**2)
+    return np.asarray(area * matching.eigenvalues(data.tensor)[0] > 1.0 / _PRECISION**2)
 
 
 def _variances(field: Field, level: Movies, data: Information) -> Array:
@@ -168,7 +168,7 @@ def _variances(field: Field, level: Movies, data: Information) -> Array:
     squares = steps**2 / np.moveaxis(np.diagonal(inverse, axis1=2, axis2=3), 2, 0)
     # Their mean around each pixel, where windows resolve the shift.
     resolved = _resolved(data, level.factor)
-    blur = partial(gaussian_filter, sigma=_WIDE / level.factor, axes=(-2, -1))
+    blur = partial(gaussian_filter, sigma=_WINDOW / level.factor, axes=(-2, -1))
     # Reduced chi-square, above 1 where the field is smoother than the reflection.
     chi = np.maximum(blur(squares * resolved) / np.maximum(blur(resolved * 1.0), 1e-9), 1.0)
     return np.asarray(chi * field.variances(level.centres()))
@@ -184,15 +184,15 @@ def _result(
     reached = matching.on_valid(np.indices(shape) + shift, np.ones(shape, dtype=bool))
     measured = _resolved(data) & reached
     distance = np.asarray(distance_transform_edt(~measured))
-    near = (distance <= _NEAR * min(shape)) & reached & measured.any()
+    region = (distance <= _EXTENT * min(shape)) & reached & measured.any()
     # Away from known pixels the field may change as much as it does in known pixels.
     slopes = np.square(np.gradient(shift, axis=(1, 2))).sum(axis=0)[:, measured]
     growth = np.multiply.outer(slopes.sum(axis=1) / max(1, measured.sum()), distance**2)
     std = np.sqrt(np.maximum(variance, 0.0) + growth)
     names = [str(name) for name in corrected["band"].values[capture.bands]]
     values = {
-        "shift": np.where(near, shift, np.nan).astype(np.float32),
-        "shift_std": np.where(near, std, np.nan).astype(np.float32),
+        "shift": np.where(region, shift, np.nan).astype(np.float32),
+        "shift_std": np.where(region, std, np.nan).astype(np.float32),
         "known": measured,
     }
     places = {name: corrected[name] for name in ("y", "x") if name in corrected.coords}

@@ -23,13 +23,13 @@ _BLURS, _FINEST = (0.08, 0.04, 0.02), 0.7
 _SMALLEST: Final = 16  # rows and columns, at least
 # A pixel farther from the median around it is bad: window [pixel], limit [standard deviation].
 _MEDIAN_WINDOW, _OUTLYING = 3, 6.0
-_READ: Final = 200  # frames that are read of a longer capture, about
+_SAMPLE: Final = 200  # frames that are read of a longer capture, about
 # Smooth curves: most frames, functions, iterations, Tukey's constant [standard deviation], and the
 # least weight, which keeps a fit to few frames solvable.
 _FRAMES, _ORDER, _ROBUST_STEPS, _TUKEY, _LEAST_WEIGHT = 128, 4, 5, 4.685, 1e-3
 # Gauss-Newton: iterations, length of the last step and excluded border [pixel], degree of the
 # polynomial between the views, and limit of the residual over its scale.
-_NEWTON, _CONVERGED, _MARGIN, _DEGREE, _CUT = 40, 1e-4, 4, 2, 3.0
+_NEWTON, _CONVERGED, _MARGIN, _DEGREE, _LIMIT = 40, 1e-4, 4, 2, 3.0
 # Prior deviation of rotation, scale, and perspective over the image [1].
 _RIGID: Final = 0.01
 _FLOOR: Final = 1e-3  # of the residuals' mean variance, in every combination of times
@@ -106,7 +106,7 @@ def register(
         numbers, frames = np.unique(corrected["segment"], return_counts=True)
         longest = corrected["segment"].values == numbers[np.argmax(frames)]
         counts = counts.isel(time=longest)
-    counts = counts.isel(time=slice(None, None, max(1, counts.sizes["time"] // _READ)))
+    counts = counts.isel(time=slice(None, None, max(1, counts.sizes["time"] // _SAMPLE)))
     if min(counts.sizes["y"], counts.sizes["x"]) < _SMALLEST:
         size = f"{counts.sizes['y']} by {counts.sizes['x']} pixels to be registered"
         raise ValueError(f"Invalid image of {size}. Must be at least {_SMALLEST} either way.")
@@ -195,30 +195,30 @@ def _fitted(pair: list[Array], matrix: Array, free: list[int], blur: float, band
     unit = span ** -np.array([1, 1, 1, 1, 1, 1, 2, 2])[free]
     rows, columns = np.divmod(free, 3)
     # Residuals are equal over the blur, and at all times: one for each 4 pi blur^2 pixels.
-    alike = 4.0 * np.pi * blur**2
-    weights, variance = np.ones(shape), alike * count  # of images without a transform
+    area = 4.0 * np.pi * blur**2
+    weights, variance = np.ones(shape), area * count  # of images without a transform
     white = np.eye(count)  # whitens the residuals over time
     prior = np.where(span > 1.0, (_RIGID * span) ** -2, 0.0)  # [1/pixel^2], none on a translation
     for _ in range(_NEWTON):
         places = positions(matrix, shape)
         overlap = _overlap(places, band)
-        first = pair[0][:, overlap]
+        reference = pair[0][:, overlap]
         values, *slopes = white @ sampled(splines, places[:, overlap]).swapaxes(1, 2)
         # I_2(H p) + (dH p) grad I_2 = f(I_1) + o, linear in dH and the numbers of f and o.
         motion = _motion(matrix, places, overlap)[rows, columns] * unit[:, np.newaxis, np.newaxis]
         design = np.concatenate(
             [
                 -np.einsum("atp,nap->ntp", slopes, motion),
-                np.matmul(white, [first**power for power in range(1, _DEGREE + 1)]),
-                np.repeat(white.T[:, :, np.newaxis], first.shape[1], axis=2),
+                np.matmul(white, [reference**power for power in range(1, _DEGREE + 1)]),
+                np.repeat(white.T[:, :, np.newaxis], reference.shape[1], axis=2),
             ]
         )
         weighted = design * weights[overlap]
         flat = weighted.reshape(len(design), -1)
         normal, right = flat @ design.reshape(len(design), -1).T, flat @ values.ravel()
-        moved = (matrix - np.eye(3)).ravel()[free] / unit  # so far [pixel]
+        displacement = (matrix - np.eye(3)).ravel()[free] / unit  # so far [pixel]
         normal[: len(free), : len(free)] += np.diag(variance * prior)
-        right[: len(free)] -= variance * prior * moved
+        right[: len(free)] -= variance * prior * displacement
         solution = np.linalg.pinv(normal, hermitian=True) @ right
         residual = values - np.tensordot(solution, design, axes=1)
         square, texture = np.sum(residual**2, axis=0), np.sum(np.square(slopes), axis=(0, 1))
@@ -226,9 +226,9 @@ def _fitted(pair: list[Array], matrix: Array, free: list[int], blur: float, band
         # of what is flat, and much may mirror other things.
         order = np.argsort(square)
         quarter = np.searchsorted(np.cumsum(texture[order]), _QUARTER * texture.sum())
-        limit = _CUT**2 * square[order[quarter]] + np.finfo(np.float32).tiny
+        limit = _LIMIT**2 * square[order[quarter]] + np.finfo(np.float32).tiny
         weights[overlap] = (1.0 - np.minimum(square / limit, 1.0)) ** 2
-        variance = alike * np.average(square, weights=weights[overlap])
+        variance = area * np.average(square, weights=weights[overlap])
         plain = np.linalg.solve(white, residual)
         covariance = (plain * weights[overlap]) @ plain.T / weights[overlap].sum()
         mean = np.trace(covariance) / count + np.finfo(np.float32).tiny
@@ -245,8 +245,8 @@ def _motion(matrix: Array, places: Array, overlap: Mask) -> Array:
     """Derivatives (3, 3, axis, pixel) of pixel places by the entries of a transform."""
     row, column = places[:, overlap]
     point = np.stack([*np.indices(places.shape[1:])[::-1, overlap], np.ones_like(row)])
-    scale, none = matrix[2] @ point, np.zeros_like(row)
-    of_product = np.stack([[none, none + 1.0], [none + 1.0, none], [-row, -column]]) / scale
+    scale, zero = matrix[2] @ point, np.zeros_like(row)
+    of_product = np.stack([[zero, zero + 1.0], [zero + 1.0, zero], [-row, -column]]) / scale
     return np.asarray(of_product[:, np.newaxis] * point[:, np.newaxis])
 
 

@@ -29,7 +29,7 @@ MAP: Final = schema.Variable(
 # 99.7 % of seven, lines 71 and 90 %.
 TAPS: Final = 6
 _ROUNDING: Final = 1e-7  # weights that are rounding [1]
-_BEYOND: Final = 0.1  # distance from the last pixel's centre at which its line holds [pixel]
+_MARGIN: Final = 0.1  # distance from the last pixel's centre at which its line holds [pixel]
 _DIGITS: Final = 9  # of a rounded position, so that a border met exactly counts [pixel]
 STEP: Final = 5.0  # standard deviations of noise of a step between two frames
 
@@ -82,28 +82,28 @@ def interpolation(places: Array, taps: int) -> csr_array:
     """Lagrange weights (pixel, pixel) [1] of `taps` pixels a side, for places (2, y, x) [pixel]."""
     shape, complete, factors = places.shape[1:], np.ones(places[0].size, dtype=bool), []
     for place, size in zip(places.reshape(2, -1), shape, strict=True):
-        within, first, weight = lagrange(place, size, taps)
-        # A place without enough neighbours has no weights, but for `_BEYOND`.
+        within, start, weight = lagrange(place, size, taps)
+        # A place without enough neighbours has no weights, but for `_MARGIN`.
         complete &= within
-        factors.append((weight, first[:, np.newaxis] + np.arange(taps, dtype=np.int32)))
+        factors.append((weight, start[:, np.newaxis] + np.arange(taps, dtype=np.int32)))
     (down, row), (right, column) = factors
     weight = (down[:, :, np.newaxis] * right[:, np.newaxis]).astype(np.float32)
     pixel = row[:, :, np.newaxis] * shape[1] + column[:, np.newaxis]
-    kept = complete[:, np.newaxis, np.newaxis] & (abs(weight) > _ROUNDING)
-    ends = np.concatenate([[0], np.cumsum(kept.sum(axis=(1, 2)))])
-    return csr_array((weight[kept], pixel[kept], ends), shape=(complete.size, complete.size))
+    mask = complete[:, np.newaxis, np.newaxis] & (abs(weight) > _ROUNDING)
+    ends = np.concatenate([[0], np.cumsum(mask.sum(axis=(1, 2)))])
+    return csr_array((weight[mask], pixel[mask], ends), shape=(complete.size, complete.size))
 
 
 def lagrange(place: Array, size: int, taps: int) -> tuple[Mask, npt.NDArray[np.int32], Array]:
     """Positions with enough neighbours on a line of pixels, the first one, and all weights."""
     nodes = np.arange(taps)
     spacing = nodes[:, np.newaxis] - nodes + np.eye(taps)
-    complete = (place >= taps // 2 - 1 - _BEYOND) & (place <= size - taps // 2 + _BEYOND)
+    complete = (place >= taps // 2 - 1 - _MARGIN) & (place <= size - taps // 2 + _MARGIN)
     position = np.where(complete, place, 0.0)
-    first = np.clip(np.floor(position) - (taps // 2 - 1), 0, size - taps)
-    away = (position - first)[:, np.newaxis] - nodes
+    start = np.clip(np.floor(position) - (taps // 2 - 1), 0, size - taps)
+    away = (position - start)[:, np.newaxis] - nodes
     factors = np.where(np.eye(taps, dtype=bool), 1.0, away[:, np.newaxis, :])
-    return complete, first.astype(np.int32), np.prod(factors / spacing, axis=2)
+    return complete, start.astype(np.int32), np.prod(factors / spacing, axis=2)
 
 
 def positions(matrix: Array, shape: tuple[int, ...]) -> Array:
@@ -147,9 +147,9 @@ def _weights(places: Array, bad: Mask) -> csr_array:
     if np.array_equal(places, np.indices(bad.shape)):
         return eye_array(bad.size, dtype=np.float32, format="csr")
     fine = interpolation(places, TAPS)
-    near = (np.diff(fine.indptr) == 0) | (abs(fine) @ bad.ravel().astype(np.float32) > 0)
+    border = (np.diff(fine.indptr) == 0) | (abs(fine) @ bad.ravel().astype(np.float32) > 0)
     coarse = interpolation(places, 2)
-    keep, swap = (diags_array(rows.astype(np.float32)) for rows in (~near, near))
+    keep, swap = (diags_array(rows.astype(np.float32)) for rows in (~border, border))
     result = csr_array(keep @ fine + swap @ coarse)
     result.eliminate_zeros()  # for a weight of 0 would pass a NaN on
     return result
@@ -194,12 +194,12 @@ def on_one_clock(
 ) -> xr.Dataset:
     """Registered views on one clock, see `align`; `steps` [standard deviation of noise]."""
     names = [str(name) for name in corrected["band"].values]
-    counts, alike = corrected["counts"], corrected
+    counts, capture = corrected["counts"], corrected
     if reflection_shift is not None:
         schema.check(reflection_shift, "reflection_shift")
     if reflection_shift is not None and offset is None:
-        alike, _ = moved(corrected, reflected(reflection_shift, corrected), lazy=lazy)
-    offsets = _offsets(alike, offset, names, search)
+        capture, _ = moved(corrected, reflected(reflection_shift, corrected), lazy=lazy)
+    offsets = _offsets(capture, offset, names, search)
     stamps = clocks.exposure_times(corrected) + offsets[:, np.newaxis]
     signals = lags.sample(corrected)
     for band in () if offset is None else range(1, len(names)):  # `time_offset` has done it
@@ -220,7 +220,7 @@ def on_one_clock(
     for band, (row, absent) in enumerate(zip(stamps, missing, strict=True)):
         plan = clocks.interpolation(row, ~absent, times, segment)
         plan.valid[plan.labels(segment) != segment] = False
-        shown = np.stack([signals[it, :, ::thin] for it in (reference, band)])
+        shown = np.stack([signals[place, :, ::thin] for place in (reference, band)])
         plans.append(lags.bent(plan, shown, times, segment, np.sqrt(3.0) * steps * noise[band]))
         factors[band], rapid[band] = plans[band].noise_factors()
 

@@ -79,9 +79,9 @@ def products(
         if rate is not None:
             signals = np.concatenate([signals, (signals[0] @ rate)[np.newaxis]])
         signals = signals.reshape(count - 1, -1, width, signals.shape[2] // number, number)
-        for place, second in enumerate(movies):
+        for place, target in enumerate(movies):
             arrays = weights[place, rows], result[place, rows], events[place, rows]
-            _sum_pairs(signals, second[rows].reshape(signals.shape[1:]), *arrays)
+            _sum_pairs(signals, target[rows].reshape(signals.shape[1:]), *arrays)
     return result, events
 
 
@@ -113,21 +113,21 @@ def sampled(splines: Any, places: Array) -> Any:
     count, planes = places.shape[1], splines.shape[2]
     result = np.zeros((3, count, planes), splines.dtype)
     along, slope = np.empty(planes, splines.dtype), np.empty(planes, splines.dtype)
-    first, weights = np.empty(2, np.intp), np.empty((2, 2, 5), splines.dtype)
+    start, weights = np.empty(2, np.intp), np.empty((2, 2, 5), splines.dtype)
     for p in range(count):
         for axis in range(2):
             low = int(np.floor(places[axis, p] - 0.5)) - 1
-            first[axis] = min(max(low, 0), splines.shape[axis] - 5)
+            start[axis] = min(max(low, 0), splines.shape[axis] - 5)
             for i in range(5):
-                away = first[axis] + i - places[axis, p]
-                weights[axis, 0, i] = _cubic(away)
-                weights[axis, 1, i] = _cubic(away - 0.5) - _cubic(away + 0.5)
+                offset = start[axis] + i - places[axis, p]
+                weights[axis, 0, i] = _cubic(offset)
+                weights[axis, 1, i] = _cubic(offset - 0.5) - _cubic(offset + 0.5)
         for i in range(5):
             along[:] = 0.0
             slope[:] = 0.0
             for j in range(5):
                 value, steep = weights[1, 0, j], weights[1, 1, j]
-                pixel = splines[first[0] + i, first[1] + j]
+                pixel = splines[start[0] + i, start[1] + j]
                 for t in range(planes):
                     along[t] += value * pixel[t]
                     slope[t] += steep * pixel[t]
@@ -140,23 +140,23 @@ def sampled(splines: Any, places: Array) -> Any:
 
 
 @compiled
-def _cubic(away: float) -> float:
+def _cubic(offset: float) -> float:
     """Cubic B-spline at a distance from its middle [pixel]."""
-    far = abs(away)
-    return (max(2.0 - far, 0.0) ** 3 - 4.0 * max(1.0 - far, 0.0) ** 3) / 6.0
+    distance = abs(offset)
+    return (max(2.0 - distance, 0.0) ** 3 - 4.0 * max(1.0 - distance, 0.0) ** 3) / 6.0
 
 
 @compiled
-def _sum_pairs(signals: Movie, last: Movie, weights: Movie, sums: Array, events: Movie) -> None:
+def _sum_pairs(signals: Movie, target: Movie, weights: Movie, sums: Array, events: Movie) -> None:
     """Sums over planes of the products of signals (signal, y, x, turn, event), in place."""
     count, height, width, turns, number = signals.shape
     products = np.empty(number, signals.dtype)
     for y, x in np.ndindex(height, width):
         pair = 0
         for i in range(count + 1):
-            first = signals[i, y, x] if i < count else last[y, x]
+            first = signals[i, y, x] if i < count else target[y, x]
             for j in range(i, count + 1):
-                second = signals[j, y, x] if j < count else last[y, x]
+                second = signals[j, y, x] if j < count else target[y, x]
                 products[:] = 0.0
                 for turn in range(turns):
                     for event in range(number):
@@ -237,7 +237,7 @@ class Spline:
             steps = _STEPS[1:2] if guess.settled else _STEPS
             sharp, trials = guess.sharpness, guess.penalty * steps
         best = -np.inf
-        blocks = np.stack([(bends.T @ (bends * it[:, np.newaxis])).toarray() for it in sharp])
+        blocks = np.stack([(bends.T @ (bends * row[:, np.newaxis])).toarray() for row in sharp])
         for trial in trials:
             # log p = (log |lambda P + R| - log |A + lambda P + R| + target' c) / 2
             before = block_diag(*(trial * blocks + self.before))
@@ -279,7 +279,7 @@ class Field:
         covariance = cho_solve((self.factor, True), np.eye(self.nodes.size))
         blocks = covariance.reshape(2, height, width, 2, height, width)
         planes = [blocks[axis, :, :, axis].transpose(0, 2, 1, 3) for axis in (0, 1)]
-        return np.stack([rows @ it.reshape(height**2, width**2) @ columns.T for it in planes])
+        return np.stack([rows @ plane.reshape(height**2, width**2) @ columns.T for plane in planes])
 
 
 def _pairs(values: Array) -> Array:

@@ -297,10 +297,10 @@ def _covariance(std: Array, bias: Array) -> Array:
 
 def _require_contrast(difference: Array, stds: Array, partner: str) -> None:
     """Refuse temperatures that differ by less than the readings resolve."""
-    contrast, least = np.abs(difference).max(), 3.0 * float(np.hypot(*stds))
-    if not contrast > least:
+    contrast, limit = np.abs(difference).max(), 3.0 * float(np.hypot(*stds))
+    if not contrast > limit:
         raise ValueError(
-            f"Invalid contrast {contrast} K between object and {partner}. Must exceed {least} K, "
+            f"Invalid contrast {contrast} K between object and {partner}. Must exceed {limit} K, "
             "three standard deviations of the difference, in some measurement."
         )
 

@@ -142,7 +142,7 @@ def fit_response(  # noqa: PLR0913 - what is known of blackbody and cameras, by 
     # Keep the measured counts with the residuals of both fits.
     result["counts"] = (("band", "temperature"), values, {"units": "count"})
     for name, kind in (("residual", "exact"), ("linear_residual", "linear")):
-        fitted = [it.counts(temperature) for it in responses.curves(result, names, kind)]
+        fitted = [curve.counts(temperature) for curve in responses.curves(result, names, kind)]
         result[name] = (("band", "temperature"), values - fitted, {"units": "count"})
     celsius = ", ".join(f"{kelvin - zero_Celsius:.2f}" for kelvin in temperature)
     stated = f"standard deviation of a reading {temperature_std:g} K"
@@ -312,8 +312,8 @@ def _check_residuals(curve: Curve, temperature: Array, counts: Array, std: float
     """Refuse counts farther from their Planck curve than errors of a standard deviation explain."""
     # The nearest curve of any shape is no farther from the counts than that of the true shape,
     # whose two linear parameters leave a chi-square of n - 2 degrees of freedom.
-    band, off = curve.band, counts - curve.counts(temperature)
-    if np.sum(off**2) <= std**2 * chdtri(counts.size - 2, _FALSE_ALARM):
+    band, deviation = curve.band, counts - curve.counts(temperature)
+    if np.sum(deviation**2) <= std**2 * chdtri(counts.size - 2, _FALSE_ALARM):
         return
     explained = f"noise and blackbody explain {std:.3g} count"
     # Readings without which the remaining readings lie on a curve.
@@ -332,11 +332,11 @@ def _check_residuals(curve: Curve, temperature: Array, counts: Array, std: float
             f"{distance:+.4g} count off the Planck curve of the others, on which they read as "
             f"{read:.1f} degC. Must lie on one; {explained}."
         )
-    place = int(np.argmax(np.abs(off)))
+    place = int(np.argmax(np.abs(deviation)))
     shortest, longest = (1e6 * edge for edge in _wavelengths(band))
     raise ValueError(
         f"Invalid counts in band '{band}', off every Planck curve of {shortest:.3g} to "
-        f"{longest:.3g} um, most at {temperature[place]:.6g} K, by {off[place]:+.4g} count. "
+        f"{longest:.3g} um, most at {temperature[place]:.6g} K, by {deviation[place]:+.4g} count. "
         f"Must follow one; {explained}."
     )
 
@@ -368,8 +368,8 @@ def fit_band(band: str, temperature: Array, counts: Array) -> Curve:
     shortest, longest = np.array(_wavelengths(band)) * middle / _SHAPE_UNIT
     options: Any = {"bounds": ((shortest, _GROWTH[0]), (longest, _GROWTH[1])), "max_nfev": 1000}
     options |= dict.fromkeys(("xtol", "ftol", "gtol"), 1e-15)
-    first = np.sqrt(shortest * longest), 1.0
-    fit = least_squares(lambda shape: linear_part(shape)[1] / span, first, **options)
+    start = np.sqrt(shortest * longest), 1.0
+    fit = least_squares(lambda shape: linear_part(shape)[1] / span, start, **options)
     amplitude, offset = linear_part(fit.x)[0]
     wavelength = _SHAPE_UNIT * fit.x[0] * fit.x[1] / middle
     shift = _SHAPE_UNIT * fit.x[0] * (1.0 - fit.x[1])

@@ -210,16 +210,16 @@ def _by_rows(measured: Callable[..., xr.Dataset], raw: xr.DataArray) -> xr.Datas
     """Correct block by block of rows, with counts that are computed when they are read."""
     blocks = [measured(rows).drop_vars("counts") for rows in _arrays.blocks(raw.shape)]
     rule: Any = {"data_vars": "minimal", "coords": "minimal", "compat": "override"}
-    whole = xr.concat(blocks, "y", combine_attrs="override", **rule)
-    if "pattern_std" in whole:
+    result = xr.concat(blocks, "y", combine_attrs="override", **rule)
+    if "pattern_std" in result:
         squares = np.array([block["pattern_std"].values ** 2 for block in blocks])
         finite = squares[np.isfinite(squares).all(axis=1)]  # blocks with a good pixel
         if len(finite):
-            whole["pattern_std"].values[:] = np.sqrt(np.mean(finite, axis=0))
-    like = raw.assign_attrs(schema.STAGES["corrected"]["counts"].attrs)
-    counts = _arrays.by_pixels(lambda *window: measured(*window)["counts"].values, like)
+            result["pattern_std"].values[:] = np.sqrt(np.mean(finite, axis=0))
+    template = raw.assign_attrs(schema.STAGES["corrected"]["counts"].attrs)
+    counts = _arrays.by_pixels(lambda *window: measured(*window)["counts"].values, template)
     dead = sum(block.attrs["dead_pixels"] for block in blocks)
-    return whole.assign(counts=counts).assign_attrs(dead_pixels=dead)
+    return result.assign(counts=counts).assign_attrs(dead_pixels=dead)
 
 
 def _events(
@@ -227,8 +227,8 @@ def _events(
 ) -> tuple[xr.Dataset, xr.Dataset, list[str]]:
     """Capture with bad frames without exposure time, its events, and sentences on both."""
     counts, closed = capture["counts"], _closed(capture)
-    even = counts["time"].astype(np.float64).expand_dims(band=counts["band"])
-    stamps = capture.get("exposure_time", even).assign_attrs(schema.EXPOSURE_TIME.attrs)
+    clock = counts["time"].astype(np.float64).expand_dims(band=counts["band"])
+    stamps = capture.get("exposure_time", clock).assign_attrs(schema.EXPOSURE_TIME.attrs)
     shut = xr.zeros_like(stamps, dtype=bool) if closed is None else closed
     valid = ~repeats & ~shut.values & stamps.notnull().values
     # First frames after the events that are known.

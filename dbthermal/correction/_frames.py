@@ -37,11 +37,11 @@ _COMES: Final = 0.4  # least share of a deviation that comes with one frame, and
 _LAGS: Final = 5  # by which the cameras may be apart [frame]
 _SHARED: Final = 0.7  # least correlation of a deviation that two bands see
 # Largest contrast of a shutter over the scene's; share of frames with less than the scene's.
-_UNIFORM, _FEW = 0.3, 0.1
+_UNIFORM, _QUANTILE = 0.3, 0.1
 _RANDOM: Final = 20.0  # differences of neighbouring pixels, relative to usual ones, of a random one
 _GAIN: Final = float(np.log(1.25))  # least change of a gain that is switched
-_ALIKE: Final = 0.9  # and least correlation of the images before and after
-_NEAR: Final = 10  # frames before and after a switched gain whose noise is compared
+_CORRELATION: Final = 0.9  # and least correlation of the images before and after
+_SIDE: Final = 10  # frames before and after a switched gain whose noise is compared
 _WINDOW: Final = 25  # frames before and after a step of the pattern
 _FEWEST: Final = 256  # pixels from which a step's variance is known within a sixth
 # Least variance of a step of the pattern, over that of noise.
@@ -67,7 +67,7 @@ class Findings:
 
     def notes(self, bands: list[str]) -> list[str]:
         """Sentences for a user."""
-        said, rows = [], zip(bands, self.bad, self.shutter, self.steps, strict=True)
+        sentences, rows = [], zip(bands, self.bad, self.shutter, self.steps, strict=True)
         for band, bad, shutter, steps in rows:
             edges = np.flatnonzero(np.diff(np.pad(bad.astype(np.int8), 1))).reshape(-1, 2)
             runs = [
@@ -77,19 +77,19 @@ class Findings:
             ]
             shown = "; ".join(runs[:_SHOWN] + ["..."] * (len(runs) > _SHOWN))
             if runs:
-                said.append(_BAD.format(band, bad.sum(), shown))
-            said += [_CHANGED.format(band, frame) for frame in np.flatnonzero(steps)]
-        return said
+                sentences.append(_BAD.format(band, bad.sum(), shown))
+            sentences += [_CHANGED.format(band, frame) for frame in np.flatnonzero(steps)]
+        return sentences
 
 
 def sampling(counts: xr.DataArray) -> dict[str, slice]:
     """Rows and columns of counts (band, time, y, x) that are looked at."""
     shape = counts.sizes["y"], counts.sizes["x"]
-    wanted = min(_PIXELS, _SAMPLES // counts.sizes["time"])
-    step = stride(shape, wanted)
+    pixels = min(_PIXELS, _SAMPLES // counts.sizes["time"])
+    step = stride(shape, pixels)
     # Whole rows, for the detail from pixel to pixel, but in a capture too long for 24 of them.
-    rows = -(-shape[0] * shape[1] // wanted)
-    whole = wanted >= _ROWS_AT_LEAST * shape[1] or step == 1
+    rows = -(-shape[0] * shape[1] // pixels)
+    whole = pixels >= _ROWS_AT_LEAST * shape[1] or step == 1
     steps = {"y": rows, "x": 1} if whole else {"y": step, "x": step}
     return {dim: slice(None, None, size) for dim, size in steps.items()}
 
@@ -138,7 +138,7 @@ def _leave_out(
     limit = np.float32(OUTLIER * np.sqrt(2.0) * noise)
     # Frames without a scene: far less contrast than nearly all have, or random from pixel to pixel.
     contrast = sections[band].std(axis=1)
-    scene = float(np.quantile(contrast[valid[band]], _FEW))
+    scene = float(np.quantile(contrast[valid[band]], _QUANTILE))
     grain = noise * np.sqrt(sections[band].shape[1] / film[0].size)
     uniform = (contrast < _UNIFORM * scene) & (scene > OUTLIER * grain)
     rough = np.abs(np.diff(film, axis=2)).mean(axis=(1, 2))
@@ -155,9 +155,9 @@ def _leave_out(
                 if not uniform[trio[0]]:
                     continue
                 # In the frames before and after, a shutter moves: a part of the image changes.
-                for side, far in ((start - 1, start - 2), (stop, stop + 1)):
-                    if 0 <= far < frames.size:
-                        change = _changed(film[frames[far]], film[frames[side]], limit)
+                for side, neighbour in ((start - 1, start - 2), (stop, stop + 1)):
+                    if 0 <= neighbour < frames.size:
+                        change = _changed(film[frames[neighbour]], film[frames[side]], limit)
                         valid[band, frames[side]] &= change <= _EDGE
                 closed = frames[max(start - 1, 0) : stop + 1]
                 closed = closed[~valid[band, closed]]
@@ -192,8 +192,8 @@ def _runs(film: Film, limit: np.float32, longest: int) -> Iterator[tuple[int, in
             continue
         # The frame in the middle deviates from both sides, which are alike.
         middle, *sides = film[places]
-        least = np.minimum(*(np.abs(middle - side) for side in sides))
-        deviant = (least > limit) & (np.abs(sides[1] - sides[0]) < _RETURN * least)
+        deviation = np.minimum(*(np.abs(middle - side) for side in sides))
+        deviant = (deviation > limit) & (np.abs(sides[1] - sides[0]) < _RETURN * deviation)
         torn = deviant.mean(axis=1) > _ROW
         if deviant.mean() > _MOST or torn.mean() > _ROWS:
             yield start, stop, places
@@ -231,8 +231,8 @@ def _is_shared(sections: Means, valid: Mask, band: int, places: Frames, span: Fr
                 continue
             partner = section[moved[0]] - section[moved[1:-2]].mean(axis=0)
             energy = np.linalg.norm(deviation) * np.linalg.norm(partner)
-            alike = deviation @ partner > _SHARED * energy
-            if alike and _is_sudden(section, moved[:-2], moved[-2:], 0.5 * _COMES):
+            agreement = deviation @ partner > _SHARED * energy
+            if agreement and _is_sudden(section, moved[:-2], moved[-2:], 0.5 * _COMES):
                 return True
     return False
 
@@ -243,13 +243,13 @@ def _is_sudden(section: Array, places: Frames, span: Frames, share: float) -> bo
     deviation = section[places[0]] - section[places[1:]].mean(axis=0)
     energy = deviation @ deviation
     if last < first:  # a step, unlike the changes before and after
-        near = np.diff(section[max(first - 2, 0) : first + 2], axis=0) @ deviation
-        return bool(np.delete(near, min(first - 1, 1)).max(initial=0.0) < _RETURN * energy)
-    sides, across = section[places[1:]], section[places[2]] - section[places[1]]
+        changes = np.diff(section[max(first - 2, 0) : first + 2], axis=0) @ deviation
+        return bool(np.delete(changes, min(first - 1, 1)).max(initial=0.0) < _RETURN * energy)
+    sides, drift = section[places[1:]], section[places[2]] - section[places[1]]
     comes, goes = section[first] - sides[0], section[last] - sides[1]
     # At an end of the capture both frames lie on one side, where a drift deviates as well.
     ends = (places[1] > places[0]) == (places[2] > places[0])
-    drifts = ends and abs(across @ deviation) > _RETURN * energy
+    drifts = ends and abs(drift @ deviation) > _RETURN * energy
     return bool(min(comes @ deviation, goes @ deviation) > share * energy and not drifts)
 
 
@@ -260,22 +260,22 @@ def _usual_gain(band: int, film: Film, sections: Means, valid: Mask) -> Mask:
     change = np.abs(np.diff(means, axis=0)).mean(axis=1)
     large = 1 + np.flatnonzero(change > OUTLIER * np.median(change))
     for place in large[(large >= FEWEST_COPIES) & (large <= len(film) - FEWEST_COPIES)]:
-        sides = film[max(place - _NEAR, 0) : place], film[place : place + _NEAR]
+        sides = film[max(place - _SIDE, 0) : place], film[place : place + _SIDE]
         noises = [float(np.median(np.abs(np.diff(side, 2, axis=0)))) for side in sides]
         scenes, pair = means[place - 1 : place + 1], frames[[place, place - 1]]
         if min(*noises, *scenes.std(axis=1)) == 0.0:
             continue
         gain = np.log(noises[1] / noises[0])
         contrast = np.log(scenes[1].std() / scenes[0].std())
-        alike = 0.5 * contrast**2 < gain * contrast
-        alike &= np.asarray(np.corrcoef(scenes))[0, 1] > _ALIKE
+        switch = 0.5 * contrast**2 < gain * contrast
+        switch &= np.asarray(np.corrcoef(scenes))[0, 1] > _CORRELATION
         jump = float(np.median(np.abs(np.diff(film[place] - film[place - 1], axis=1))))
-        alike &= min(abs(gain), abs(contrast)) > _GAIN and abs(gain) < 1.5 * abs(contrast)
+        switch &= min(abs(gain), abs(contrast)) > _GAIN and abs(gain) < 1.5 * abs(contrast)
         renewed = abs(gain) > _GAIN and jump > OUTLIER * max(noises)
-        if (alike or renewed) and not _is_shared(sections, valid, band, pair, pair):
+        if (switch or renewed) and not _is_shared(sections, valid, band, pair, pair):
             level[pair[0] :] += gain
-    near = np.abs(level[:, np.newaxis] - np.unique(level[valid[band]])) < 0.5 * _GAIN
-    return np.asarray(near[:, np.argmax(near[valid[band]].sum(axis=0))])
+    members = np.abs(level[:, np.newaxis] - np.unique(level[valid[band]])) < 0.5 * _GAIN
+    return np.asarray(members[:, np.argmax(members[valid[band]].sum(axis=0))])
 
 
 def _steps(films: list[Film], valid: Mask, renewals: Mask) -> Mask:
@@ -308,7 +308,7 @@ def _scores(detail: Film, valid: Mask, renewals: Mask) -> Array:
     width = min(_WINDOW, len(frames) // 3)
     flat = detail[frames].astype(np.float64)
     noise = MAD * float(np.median(np.abs(np.diff(flat, axis=0)))) / np.sqrt(2.0)
-    if noise > 0.0 and width >= _NEAR and flat.shape[1] >= _FEWEST:
+    if noise > 0.0 and width >= _SIDE and flat.shape[1] >= _FEWEST:
         total = np.cumsum(np.pad(flat, ((1, 0), (0, 0))), axis=0)
         steps = total[2 * width :] - 2.0 * total[width:-width] + total[: -2 * width]
         ratio = (MAD * np.median(np.abs(steps), axis=1)) ** 2 / (2.0 * width * noise**2)
@@ -324,15 +324,15 @@ def _change(detail: Film, valid: Mask, frame: int) -> tuple[Film, Array, float]:
     if min(before.size, after.size) == 0:
         return np.zeros(detail.shape[1], dtype=np.float32), np.zeros(len(detail)), 0.0
     # Means of the frames on both sides, near and far.
-    near, far = (
+    step, remainder = (
         detail[after[section] if after[section].size else after].mean(axis=0)
         - detail[before[section] if before[section].size else before].mean(axis=0)
         for section in (slice(_WINDOW), slice(_WINDOW, 2 * _WINDOW))
     )
     # Shares where the detail changes most.
-    strong = np.abs(near) > np.median(np.abs(near))
+    strong = np.abs(step) > np.median(np.abs(step))
     frames = np.sort(np.concatenate([before[:_WINDOW], after[:_WINDOW]]))
     shares = np.zeros(len(detail))
     jumps = np.diff(detail[frames][:, strong], axis=0)
-    shares[frames[1:]] = np.median(jumps / near[strong], axis=1)
-    return near, shares, float(np.median(far[strong] / near[strong]))
+    shares[frames[1:]] = np.median(jumps / step[strong], axis=1)
+    return step, shares, float(np.median(remainder[strong] / step[strong]))

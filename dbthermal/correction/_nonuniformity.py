@@ -269,11 +269,11 @@ def correct(
     )
     if correction.keys() >= _PATTERN:
         result["pattern_std"] = _pattern_std(correction, result["counts"], status == 0)
-    done = {f"gain_offset_{key}": it for key, it in correction.attrs.items() if key in _PARAMETERS}
-    done |= {"gain_offset_corrected": 1 - correction.attrs.get("by_camera", 0)}
-    done |= {"dead_pixels": int(bad.sum()), "saturated_pixels": int(saturated.sum())}
-    done |= {"detector_maximum": maximum} | schema.origin(capture.attrs, correction.attrs)
-    return schema.check(result.assign_attrs(done), "corrected")
+    attrs = {f"gain_offset_{key}": it for key, it in correction.attrs.items() if key in _PARAMETERS}
+    attrs |= {"gain_offset_corrected": 1 - correction.attrs.get("by_camera", 0)}
+    attrs |= {"dead_pixels": int(bad.sum()), "saturated_pixels": int(saturated.sum())}
+    attrs |= {"detector_maximum": maximum} | schema.origin(capture.attrs, correction.attrs)
+    return schema.check(result.assign_attrs(attrs), "corrected")
 
 
 def _residual_pattern(residual: Array, level: Array, blackbody: xr.Dataset) -> dict[str, Array]:

@@ -150,14 +150,14 @@ def mark_shutter(corrected: xr.Dataset, events: xr.Dataset | None = None) -> xr.
     within = renewed & (first > 0) & (after < frames)
     changes = _changes(first[within], after[within])
     segment = np.searchsorted(changes, np.arange(frames), side="right").astype(np.int32)
-    kept = xr.DataArray(~marked, dims=("band", "time"), coords={"band": counts["band"]})
+    mask = xr.DataArray(~marked, dims=("band", "time"), coords={"band": counts["band"]})
     result = corrected.assign(
-        counts=counts.where(kept).assign_attrs(counts.attrs),
+        counts=counts.where(mask).assign_attrs(counts.attrs),
         segment=("time", segment, schema.SEGMENT.attrs),
     )
-    number, taken = int(renewed.sum()), marked.sum(axis=1).tolist()
+    number, losses = int(renewed.sum()), marked.sum(axis=1).tolist()
     return result.assign_attrs(
-        shutter_events=number, repeated_frames=renewed.size - number, frames_taken_out=taken
+        shutter_events=number, repeated_frames=renewed.size - number, frames_taken_out=losses
     )
 
 
@@ -175,21 +175,21 @@ def distinct(capture: xr.Dataset) -> tuple[xr.Dataset, Mask]:
     # Of m showings of a frame keep every r-th, m / r and at least one, with r the median: an image
     # that the sensor itself repeats, as behind a closed shutter, stays repeated.
     place = frames - first[slowest]
-    least = np.maximum(1, np.rint(numbers[slowest] / shown[slowest]))
-    least = np.repeat(least, numbers[slowest]) * shown[slowest]
-    kept = np.flatnonzero((place % shown[slowest] == 0) & (place < least))
-    first, result = first[:, kept], capture.isel(time=kept)
+    quota = np.maximum(1, np.rint(numbers[slowest] / shown[slowest]))
+    quota = np.repeat(quota, numbers[slowest]) * shown[slowest]
+    selection = np.flatnonzero((place % shown[slowest] == 0) & (place < quota))
+    first, result = first[:, selection], capture.isel(time=selection)
     # Remaining copies (band, time). Frames of other bands exposed earlier get an `exposure_time`.
     duplicate = np.diff(first, axis=1, prepend=-1) == 0
-    if np.any((first != kept) & ~duplicate):
-        even = capture["time"].astype(np.float64).expand_dims(band=counts["band"])
-        stamps = np.take_along_axis(capture.get("exposure_time", even).values, first, axis=1)
+    if np.any((first != selection) & ~duplicate):
+        clock = capture["time"].astype(np.float64).expand_dims(band=counts["band"])
+        stamps = np.take_along_axis(capture.get("exposure_time", clock).values, first, axis=1)
         stamps = np.where(duplicate, np.nan, stamps)
         result = result.assign(exposure_time=(("band", "time"), stamps, schema.EXPOSURE_TIME.attrs))
     pairs = zip(counts["band"].values, shown, strict=True)
     label = ", ".join(f"{number} times in band '{band}'" for band, number in pairs if number > 1)
-    said = f"Each frame is repeated, {label}: a stream faster than its sensor. One of each is kept"
-    return schema.warned(result, said), duplicate
+    note = f"Each frame is repeated, {label}: a stream faster than its sensor. One of each is kept"
+    return schema.warned(result, note), duplicate
 
 
 def copies(counts: xr.DataArray) -> Mask:
@@ -209,10 +209,10 @@ def copies(counts: xr.DataArray) -> Mask:
     candidates = 1 + np.flatnonzero(valid.any(axis=(1, 2)) & ~changed.any(axis=(1, 2)))
     if candidates.size:
         repeats[candidates] = True
-        needed = np.union1d(candidates, candidates - 1)
-        after, before = (np.searchsorted(needed, frame) for frame in (candidates, candidates - 1))
-        for rows in _arrays.blocks((needed.size, *counts.shape[1:]), _BLOCK):
-            block = counts.isel(time=needed, y=rows).values
+        frames = np.union1d(candidates, candidates - 1)
+        after, before = (np.searchsorted(frames, frame) for frame in (candidates, candidates - 1))
+        for rows in _arrays.blocks((frames.size, *counts.shape[1:]), _BLOCK):
+            block = counts.isel(time=frames, y=rows).values
             repeats[candidates] &= ~_changed(block[before], block[after])[0].any(axis=(1, 2))
     return repeats
 
@@ -441,10 +441,10 @@ def refer(corrected: xr.Dataset, reference: Reference, *, lazy: bool) -> xr.Data
     remaining, lines, notes = {}, np.empty((2, len(names), 1, 1, 1)), list[str]()
     stated, std = responses.accuracy(reference.response, names), reference.temperature_std
     for band, curve in enumerate(responses.curves(reference.response, names)):
-        seen = np.array([mean[band] for mean in means])
-        wanted = curve.counts(temperatures)
-        gain = np.polyfit(seen, wanted, 1)[0] if len(seen) > 1 else 1.0
-        lines[:, band, 0, 0, 0] = gain, np.mean(wanted - gain * seen)
+        levels = np.array([mean[band] for mean in means])
+        targets = curve.counts(temperatures)
+        gain = np.polyfit(levels, targets, 1)[0] if len(levels) > 1 else 1.0
+        lines[:, band, 0, 0, 0] = gain, np.mean(targets - gain * levels)
         # What remains unknown of the level and the gain.
         errors = np.array([std[band] for std in stds]) / curve.count_slope(temperatures)
         remaining[names[band]] = {"offset_std": float(np.sqrt(np.mean(errors**2) / len(errors)))}
@@ -452,10 +452,10 @@ def refer(corrected: xr.Dataset, reference: Reference, *, lazy: bool) -> xr.Data
             scatter = np.sum((temperatures - temperatures.mean()) ** 2)
             remaining[names[band]]["gain_std"] = float(np.sqrt(np.mean(errors**2) / scatter))
         # Patches that contradict the calibration.
-        off = (seen - wanted) / curve.count_slope(temperatures)
-        times = np.abs(off) / np.hypot(stated.reading(band, temperatures), std)
+        bias = (levels - targets) / curve.count_slope(temperatures)
+        times = np.abs(bias) / np.hypot(stated.reading(band, temperatures), std)
         for patch in np.flatnonzero(times > _DOUBTED):
-            label = f"Patch {patch} of {temperatures[patch]:.6g} K reads about {off[patch]:+.2g} K"
+            label = f"Patch {patch} of {temperatures[patch]:.6g} K reads about {bias[patch]:+.2g} K"
             label += f" off in band '{names[band]}', {times[patch]:.0f} deviations of its response"
             notes.append(f"{label}. Must be black, and right: all levels follow it.")
     film = _arrays.changed(counts, lambda values: lines[0] * values + lines[1], lazy=lazy)

@@ -27,20 +27,20 @@ from dbthermal.separation._inputs import Inputs
 from dbthermal.separation._misfit import Misfit, Reading
 
 _ROUNDS, _STEP, _SETTLED = 8, 4.0, 0.05  # turns, largest step [pixel^2], last step over the sum
-_AROUND: Final = 13  # pixels along a side of a neighbourhood with one error of the ratio
+_WINDOW: Final = 13  # pixels along a side of a neighbourhood with one error of the ratio
 # Side [pixel] of what is one material, its largest ratio over the smallest, and the share of the
 # pixels that must be so.
-_BORDER, _ALIKE, _MOSTLY = 7, 1.05, 0.2
+_BORDER, _MAX_RATIO, _MOSTLY = 7, 1.05, 0.2
 # Blur of both bands [pixel^2], against noise: it leaves their difference as it is.
-_COMMON: Final = 2.0
+_BASE: Final = 2.0
 _BROAD: Final = 25.0  # blur that tells what is broad [pixel^2]
 _FEWEST: Final = 16  # rows and columns of an image, whose edges are left out, at least
 _EDGE: Final = 6  # pixels at the image's edge that are left out
-_MOVING: Final = 1.0  # variance of the changes over that of noise
+_CONTRAST: Final = 1.0  # variance of the changes over that of noise
 # Deviations and size [pixel^2] of a difference that counts, and deviations in some rows from which
 # it is sought in all: 0 to 2 in plain scenes, 8 to 25 for 0.5 and 1.3 pixels.
-_SURE, _LEAST, _HINT = 6.0, 0.1, 3.0
-_MOST: Final = 100.0  # difference [pixel^2]: wider than that it is no blur
+_SIGMAS, _SIZE, _HINT = 6.0, 0.1, 3.0
+_LIMIT: Final = 100.0  # difference [pixel^2]: wider than that it is no blur
 _BLOCKS: Final = 8  # of rows that tell it
 # Share of what a blur of the object changes that must be for the better: of lenses .47 to .93, of
 # rough surfaces -.5 to -.95; of objects without detail, whose blur does not matter, -.1 to .3.
@@ -153,7 +153,7 @@ def _explained(target: Array, maps: Array, noise: float) -> tuple[Array, Array]:
 
 
 def _local(maps: Array) -> Array:
-    return np.asarray(ndimage.uniform_filter(maps, _AROUND, axes=(-2, -1)))
+    return np.asarray(ndimage.uniform_filter(maps, _WINDOW, axes=(-2, -1)))
 
 
 def _noise_after(variance: float) -> float:
@@ -180,8 +180,8 @@ def _blocks(inputs: Inputs) -> list[slice]:
 
 def sharpness(inputs: Inputs, result: xr.Dataset, reading: Reading) -> list[Sums] | None:
     """Sums of each other band's blur, from the rows in the middle; None of other rows."""
-    every = _blocks(inputs)
-    if not every or reading.rows != every[len(every) // 2]:
+    blocks = _blocks(inputs)
+    if not blocks or reading.rows != blocks[len(blocks) // 2]:
         return None
     places = range(1, len(inputs.bands))
     return [_equations(inputs, result, place, 0.0, reading, _LEADING) for place in places]
@@ -189,24 +189,24 @@ def sharpness(inputs: Inputs, result: xr.Dataset, reading: Reading) -> list[Sums
 
 def _difference(inputs: Inputs, result: xr.Dataset, place: int) -> float:
     """Variance [pixel^2] of a band's blur less that of the first one; 0 if it may be none."""
-    excess, every = 0.0, _blocks(inputs)
-    rows = every[:: max(1, len(every) // _BLOCKS)]
+    excess, blocks = 0.0, _blocks(inputs)
+    rows = blocks[:: max(1, len(blocks) // _BLOCKS)]
     for turn in range(_ROUNDS):
         readings = (misfits.reflected(inputs, result, block) for block in rows)
         sums = [_equations(inputs, result, place, excess, reading) for reading in readings]
         forces, form, variance = np.sum(sums, axis=0)
-        if form <= 0.0 or (turn == 0 and forces**2 < _SURE**2 * variance):
+        if form <= 0.0 or (turn == 0 and forces**2 < _SIGMAS**2 * variance):
             return 0.0
         step = 2.0 * forces / form
         excess += float(np.clip(step, -_STEP, _STEP))
         if abs(step) < _SETTLED * abs(excess):
-            return excess if 2.0 * _LEAST < abs(excess) < _MOST else 0.0
+            return excess if 2.0 * _SIZE < abs(excess) < _LIMIT else 0.0
     return 0.0
 
 
 def _details(image: Array, excess: float) -> Array:
     """An image blurred by an excess [pixel^2], less its broad part, in which rapid heat spreads."""
-    fine, broad = (_blurred(image, float(np.sqrt(it + excess))) for it in (_COMMON, _BROAD))
+    fine, broad = (_blurred(image, float(np.sqrt(blur + excess))) for blur in (_BASE, _BROAD))
     return np.asarray(fine - broad)
 
 
@@ -224,11 +224,11 @@ def _equations(
     ratio = result["reflection_ratio"].values[inputs.bands[place], rows]
     inner = np.pad(np.ones(np.subtract(shape, 2 * _EDGE), dtype=bool), _EDGE)
     moving = pixels.reshape(shape) & np.isfinite(ratio)
-    ratio, used = np.where(moving, ratio, 1.0), inner & moving
+    ratio, mask = np.where(moving, ratio, 1.0), inner & moving
     # At the border of a material reflectivities change, not reflections.
     least = ndimage.minimum_filter(ratio, _BORDER)
-    within = ndimage.maximum_filter(ratio, _BORDER) < _ALIKE * least
-    used &= within | (np.count_nonzero(used & within) < _MOSTLY * np.count_nonzero(used))
+    interior = ndimage.maximum_filter(ratio, _BORDER) < _MAX_RATIO * least
+    mask &= interior | (np.count_nonzero(mask & interior) < _MOSTLY * np.count_nonzero(mask))
     blurs = max(excess, 0.0), max(-excess, 0.0)
     basis = smooth_functions(inputs.capture, frames).functions
     # Leading functions of time hold most of the rapid changes, at less cost.
@@ -244,8 +244,8 @@ def _equations(
 
     # Mask and divide before a blur: broad parts do not compare where ratios differ or are missing.
     first, second = (
-        np.stack([_details(image * part, blur) for image in films[order].reshape(-1, *shape)])
-        for order, part, blur in zip((0, place), (moving, moving / ratio), blurs, strict=True)
+        np.stack([_details(image * scale, blur) for image in films[order].reshape(-1, *shape)])
+        for order, scale, blur in zip((0, place), (moving, moving / ratio), blurs, strict=True)
     )
     remainder, reflection = rapid(second - first), rapid(first)
     curvature = rapid(ndimage.laplace(first, axes=(1, 2)))
@@ -267,12 +267,12 @@ def _equations(
     )
     # The error of the ratio, of a neighbourhood, is eliminated.
     local = [
-        ndimage.uniform_filter(np.where(used, values, 0.0), _AROUND, mode="constant")
-        for values in (*products, _MOVING * level)
+        ndimage.uniform_filter(np.where(mask, values, 0.0), _WINDOW, mode="constant")
+        for values in (*products, _CONTRAST * level)
     ]
-    used &= local[2] > local[5]
+    mask &= local[2] > local[5]
     share = quotient(local[3], local[2], 0.0)
     forces, form = products[1] - share * products[0], products[4] - share * products[3]
     noisy = levels[1] * np.square(gain[1]).reshape(shape) / ratio**2
     variance = (noisy + levels[0]) * (form + bending)
-    return float(forces[used].sum()), float(form[used].sum()), float(variance[used].sum())
+    return float(forces[mask].sum()), float(form[mask].sum()), float(variance[mask].sum())

@@ -43,7 +43,7 @@ _FRAMES: Final = 16  # of a film, at least, that give its root mean square
 # are 0.62 to 1.48 times those in 8-14 um, by measured spectra (Atmospheric Radiation Measurement).
 _COLD, SKY = 278.15, 0.4
 _SINGULAR: Final = 1e-9  # determinant, over its terms, of bands that tell no two temperatures
-_WHOLE: Final = np.uint32(schema.COMPLETED & ~schema.Status.COMPLETED_FRAMES)
+_COMPLETION: Final = np.uint32(schema.COMPLETED & ~schema.Status.COMPLETED_FRAMES)
 
 
 def added(result: xr.Dataset, inputs: Inputs) -> xr.Dataset:
@@ -78,24 +78,24 @@ def without_calibration(result: xr.Dataset, *, drift: bool = True) -> xr.Dataset
         Keep the part by a background that may have drifted along with the object.
     """
     schema.check(result, "separated")
-    alone = result.drop_vars(["cause", *BUDGETS.values()], errors="ignore")
+    output = result.drop_vars(["cause", *BUDGETS.values()], errors="ignore")
     by_drift = np.zeros(1) if _numbers.truth_value("drift", drift) else _drift(result)
     for name in (name for name, budget in BUDGETS.items() if budget in result):
         # Of the background the drift's part goes with the contrast of each frame, see below.
-        parts = [*CALIBRATION, *(["drift"] if not drift and name == "emissivity" else [])]
-        deviations = result[BUDGETS[name]].sel(cause=parts).values
+        causes = [*CALIBRATION, *(["drift"] if not drift and name == "emissivity" else [])]
+        deviations = result[BUDGETS[name]].sel(cause=causes).values
         variance, std = (deviations.astype(np.float64) ** 2).sum(axis=0), result[f"{name}_std"]
         values = empty(std.shape, std.dtype)
         for place, image in enumerate(std.values):
-            less = variance if variance.ndim == 2 else variance[place]
+            budget = variance if variance.ndim == 2 else variance[place]
             if by_drift.any() and name == "background_temperature":
                 warm, cold = (result[film].values[place] for film in _FILMS)
-                less = less + (by_drift * (warm - cold)) ** 2
+                budget = budget + (by_drift * (warm - cold)) ** 2
             square = image.astype(np.float64) ** 2
-            values[place] = np.sqrt(np.maximum(square - less, 0.0)) if less.any() else image
+            values[place] = np.sqrt(np.maximum(square - budget, 0.0)) if budget.any() else image
             release()
-        alone[f"{name}_std"] = std.copy(data=values)
-    return alone
+        output[f"{name}_std"] = std.copy(data=values)
+    return output
 
 
 def _drift(result: xr.Dataset) -> Array:
@@ -117,7 +117,7 @@ def _add(
     value = cut["emissivity"].values.astype(np.float64)
     value = np.where(np.isfinite(value), value, assumed)
     # What is completed as a whole is read in one band.
-    single = ((cut["status"].values & _WHOLE) != 0) | ~np.isfinite(value).all(axis=0)
+    single = ((cut["status"].values & _COMPLETION) != 0) | ~np.isfinite(value).all(axis=0)
     weights = _weights(np.where(np.isfinite(value), value, 1.0), noise, single, reference)
     films = [cut[name].values for name in _FILMS]
     ratio_std = cut["reflection_ratio_std"].values
@@ -130,8 +130,8 @@ def _add(
     colour[reference] = 0.0
     by_colour = contrast * _combined(weights, colour)
     if stated is not None:
-        apart = np.where(single, 0.0, _rms(films[0], films[1]))
-        scaled = stated.deviations(value, cut["emissivity_std"].values, apart)
+        difference = np.where(single, 0.0, _rms(films[0], films[1]))
+        scaled = stated.deviations(value, cut["emissivity_std"].values, difference)
         by_colour = np.hypot(by_colour, _combined(weights, scaled))
     drift = np.where(single, 0.0, _drift(cut))
     by_drift = np.zeros_like(drift), drift * _rms(films[0], films[1])
@@ -185,10 +185,10 @@ def _weights(value: Array, noise: Array, single: Any, reference: int) -> Array:
     # Least squares of the bands; of a single band, or bands alike, the reading of the reference.
     divisor = np.where(single, 1.0, xx * yy - xy**2)
     solution = np.stack([value * yy - cold * xy, cold * xx - value * xy]) * inverse / divisor
-    alone = np.zeros_like(solution)
-    alone[0, reference] = 1.0 / np.where(value[reference] > 0.0, value[reference], 1.0)
-    alone[1, reference] = 1.0
-    return np.where(single, alone, solution)
+    reading = np.zeros_like(solution)
+    reading[0, reference] = 1.0 / np.where(value[reference] > 0.0, value[reference], 1.0)
+    reading[1, reference] = 1.0
+    return np.where(single, reading, solution)
 
 
 def _combined(weights: Array, stds: Array) -> Array:

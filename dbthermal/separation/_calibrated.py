@@ -28,7 +28,7 @@ from dbthermal.separation._tiles import Array, Estimate, Mask, Tile
 _GRAY_SIGMAS: Final = 4.0
 _LEAST_DIFFERENCE: Final = 1e-6
 # Variance about the reference of a background that may have any temperature [K^2].
-_ANY: Final = 1e12
+_PRIOR_VARIANCE: Final = 1e12
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def separate(tile: Tile, settings: CalibratedSettings) -> Estimate:
     # Solve every frame, and smooth the object.
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         shared = np.pad(covariance, ((0, 1), (0, 1), (0, 0)))  # the level is of no weight
-        solution = frames.solve(tile, e, level, np.full_like(level, _ANY), shared)
+        solution = frames.solve(tile, e, level, np.full_like(level, _PRIOR_VARIANCE), shared)
         solved = np.isfinite(solution.signal)
         signal, left = solution.signal, solution.white
         if settings.smooth and len(signal) > 1:
@@ -86,8 +86,8 @@ def _gray(emissivity: Array, covariance: Array) -> Mask:
     squares = np.einsum("bbp->bp", covariance)
     variance = squares + ratio**2 * squares[0] - 2.0 * ratio * covariance[0]
     std = np.sqrt(np.maximum(variance, 0.0)) / dark[0]
-    least = np.maximum(_LEAST_DIFFERENCE / dark[0], _GRAY_SIGMAS * std)
-    return np.asarray(np.all(np.abs(ratio - 1.0) <= least, axis=0))
+    threshold = np.maximum(_LEAST_DIFFERENCE / dark[0], _GRAY_SIGMAS * std)
+    return np.asarray(np.all(np.abs(ratio - 1.0) <= threshold, axis=0))
 
 
 METHOD: Final = Method(separate, settings=CalibratedSettings, knows_emissivity=True, any_bands=True)

@@ -21,11 +21,11 @@ _FLAGS_NAMED: Final = 3  # flags that are named
 _SAMPLES: Final = 2**24  # of a band, in which a step of a camera's level is sought, at most
 _FEWEST: Final = 100  # pixels in which such a step is sought, at least
 _PAUSE: Final = 1.5  # frame periods, from which two frames do not follow one another
-_AROUND: Final = 9  # frames whose median change is a lasting one of the scene
+_WINDOW: Final = 9  # frames whose median change is a lasting one of the scene
 # Least step in deviations of noise, and of flicker, of which 280 frames have up to 3.7; share of a
 # step that another band may show, with so many deviations of its noise.
 _CERTAIN, _RARE, _SHARE, _SIGMAS = 16.0, 6.0, 0.15, 4.0
-_EVEN: Final = 0.5  # difference of mean and median, relative to a step of all pixels
+_SKEW: Final = 0.5  # difference of mean and median, relative to a step of all pixels
 
 
 def against_response(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
@@ -45,10 +45,10 @@ def against_response(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
     ends = [curve.counts([curve.lowest, curve.highest]) for curve in curves]
     fitting = list[str]()  # the band of each, whose range the fewest samples lie outside
     for place, (name, film, std) in enumerate(zip(names, counts, stds, strict=True)):
-        every = film[:: max(1, len(film) // _FRAMES), ::step, ::step].values[:, good]
-        beyond = [RANGE_SIGMAS * std * np.array([-1, 1]) + end for end in ends]
-        number = max(1, np.count_nonzero(~np.isnan(every)))
-        shares = [((every < low) | (every > high)).sum() / number for low, high in beyond]
+        samples = film[:: max(1, len(film) // _FRAMES), ::step, ::step].values[:, good]
+        limits = [RANGE_SIGMAS * std * np.array([-1, 1]) + end for end in ends]
+        number = max(1, np.count_nonzero(~np.isnan(samples)))
+        shares = [((samples < low) | (samples > high)).sum() / number for low, high in limits]
         fitting.append(names[int(np.argmin(shares))])
         if shares[place] > _OUTSIDE:
             low, high = ends[place]
@@ -75,11 +75,11 @@ def of_one_camera(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
     valid = schema.measured(films).all(axis=0)
     valid = valid[1:] & valid[:-1]
     number = valid.sum(axis=1)
-    seen = joined & (number > max(_FEWEST, 0.5 * valid.shape[1]))
-    if not seen.any():  # too few pixels tell it
+    frames = joined & (number > max(_FEWEST, 0.5 * valid.shape[1]))
+    if not frames.any():  # too few pixels tell it
         return []
     names, sentences = [str(name) for name in counts["band"].values], list[str]()
-    slopes = np.array([[it.reference_slope] for it in responses.curves(response, names)])
+    slopes = np.array([[curve.reference_slope] for curve in responses.curves(response, names)])
     with np.errstate(invalid="ignore"):
         changes = np.where(valid, np.diff(films, axis=1), np.nan)  # [count]
     # Changes less lasting ones of the scene; a quartile lies 0.67 deviations from the median.
@@ -88,20 +88,20 @@ def of_one_camera(corrected: xr.Dataset, response: xr.Dataset) -> list[str]:
     quartiles = np.take_along_axis(ordered, ranks[np.newaxis], axis=2)
     low, middle, high = np.moveaxis(quartiles, 2, 0) / slopes
     mean = np.nansum(changes, axis=2, dtype=np.float64) / np.maximum(number, 1) / slopes
-    noise = 0.5 * MAD * np.median((high - low)[:, seen], axis=1) / np.sqrt(valid.shape[1])
+    noise = 0.5 * MAD * np.median((high - low)[:, frames], axis=1) / np.sqrt(valid.shape[1])
     mean, median = (
-        np.where(seen, film - median_filter(film, (1, _AROUND)), 0.0)
-        for film in (np.where(seen, mean, 0.0), np.where(seen, middle, 0.0))
+        np.where(frames, film - median_filter(film, (1, _WINDOW)), 0.0)
+        for film in (np.where(frames, mean, 0.0), np.where(frames, middle, 0.0))
     )
-    flicker = MAD * np.median(np.abs(mean[:, seen]), axis=1)  # of whole frames
+    flicker = MAD * np.median(np.abs(mean[:, frames]), axis=1)  # of whole frames
     unseen = np.abs(mean) + _SIGMAS * noise[:, np.newaxis]
     for place, size in enumerate(np.abs(mean)):
-        single = np.all(np.delete(unseen, place, axis=0) < _SHARE * size, axis=0)
-        single &= size > max(_CERTAIN * noise[place], _RARE * flicker[place])
+        jumps = np.all(np.delete(unseen, place, axis=0) < _SHARE * size, axis=0)
+        jumps &= size > max(_CERTAIN * noise[place], _RARE * flicker[place])
         # A part of the image that moves changes the mean but not the median; a camera changes both.
-        single &= np.abs(median[place] - mean[place]) < _EVEN * size
-        if single.any():
-            frame = int(np.argmax(size * single))
+        jumps &= np.abs(median[place] - mean[place]) < _SKEW * size
+        if jumps.any():
+            frame = int(np.argmax(size * jumps))
             sentences.append(
                 f"The level of band '{names[place]}' steps by "
                 f"{mean[place, frame]:.2g} K at {time[frame + 1]:g} s in all pixels, and no other "

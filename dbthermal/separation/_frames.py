@@ -189,9 +189,9 @@ def _solve(
             work.object[t] = room if np.isnan(work.object[t]) else work.object[t]
         for _ in range(_STEPS):
             for m in range(shares.shape[1]):
-                seen = work.background if shares[0, m] > 0 else work.room
+                source = work.background if shares[0, m] > 0 else work.room
                 kernels.blackbody(tables[m], work.object, work.emitted[m], work.slope[m])
-                kernels.blackbody(tables[m], seen, work.behind[m], work.rate[m])
+                kernels.blackbody(tables[m], source, work.behind[m], work.rate[m])
             if _step(signals[p], parameters[p], shares[0], levels[p], work, result[:2, p]):
                 break
         at_room = kernels.exact(tables[0], room)[1]
@@ -213,25 +213,25 @@ def _step(
         for t in range(ss.size):
             by_s = e * work.slope[m, t] / work.slope[0, t]
             by_r = dark * work.rate[m, t] / work.rate[0, t]
-            off = signal[m, t] - work.behind[m, t] - e * (work.emitted[m, t] - work.behind[m, t])
+            error = signal[m, t] - work.behind[m, t] - e * (work.emitted[m, t] - work.behind[m, t])
             ss[t] += weight * by_s**2
             sr[t] += weight * by_s * by_r
             rr[t] += weight * by_r**2
-            to_s[t] += weight * by_s * off
-            to_r[t] += weight * by_r * off
-    lacking = 0.0
+            to_s[t] += weight * by_s * error
+            to_r[t] += weight * by_r * error
+    failures = 0.0
     for t in range(ss.size):
-        least = 1.0 / (ss[t] * rr[t] - sr[t] ** 2)
-        step = (rr[t] * to_s[t] - sr[t] * to_r[t]) * least
-        change = (ss[t] * to_r[t] - sr[t] * to_s[t]) * least
-        ss[t], sr[t], rr[t] = ss[t] * least, sr[t] * least, rr[t] * least
+        inverse = 1.0 / (ss[t] * rr[t] - sr[t] ** 2)
+        step = (rr[t] * to_s[t] - sr[t] * to_r[t]) * inverse
+        change = (ss[t] * to_r[t] - sr[t] * to_s[t]) * inverse
+        ss[t], sr[t], rr[t] = ss[t] * inverse, sr[t] * inverse, rr[t] * inverse
         work.object[t] += step / work.slope[0, t]
         work.background[t] += change / work.rate[0, t]
         solved = abs(step) + abs(change) <= _CONVERGED
         result[0, t] = work.emitted[0, t] + step if solved else np.nan
         result[1, t] = work.behind[0, t] + change if solved else np.nan
-        lacking += 0.0 if solved else 1.0
-    return bool(lacking == 0.0)
+        failures += 0.0 if solved else 1.0
+    return bool(failures == 0.0)
 
 
 @kernels.compiled
@@ -296,20 +296,20 @@ def background(
     """
     curve, e, dark = tile.curves[0], emissivity[0], 1.0 - emissivity[0]
     signal = curve.signal(measured[0]) - tile.reference
-    seen = np.where(valid, mixing.background(e, tile.signals[0], signal), np.nan)
-    used = np.isfinite(seen)
-    number = np.maximum(used.sum(axis=0), 1)
+    reflection = np.where(valid, mixing.background(e, tile.signals[0], signal), np.nan)
+    mask = np.isfinite(reflection)
+    number = np.maximum(mask.sum(axis=0), 1)
 
     def mean(values: Array) -> Array:
-        return np.asarray(np.where(used, values, 0.0).sum(axis=0) / number)
+        return np.asarray(np.where(mask, values, 0.0).sum(axis=0) / number)
 
     noise = (tile.noise[0] / dark) ** 2
     common = mean((e * measured[1] * curve.slope(measured[0]) / dark) ** 2) + noise / number
     by_change, by_level = fluctuation / (fluctuation + noise), fluctuation / (fluctuation + common)
-    middle, off = mean(seen), (seen - signal) / dark
-    value = level + by_level * (middle - level) + by_change * (seen - middle)
+    middle, off = mean(reflection), (reflection - signal) / dark
+    value = level + by_level * (middle - level) + by_change * (reflection - middle)
     # dr_0 = (r_0 - s) / (1 - e_1) de_1
-    slope = np.zeros((len(covariance), *seen.shape))
+    slope = np.zeros((len(covariance), *reflection.shape))
     slope[0] = by_level * mean(off) + by_change * (off - mean(off))
     slope[-1] = 1.0 - by_level
     through = np.einsum("itp,ijp,jtp->tp", slope, covariance, slope, optimize=True)

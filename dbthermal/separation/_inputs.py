@@ -25,16 +25,16 @@ Labels = npt.NDArray[np.intp]
 BLOCK_ROWS: Final = 32
 """Rows that are read at once: a lazy capture is then decoded about once."""
 # Samples of a band in a block of rows, at most: of a long capture it has fewer rows.
-_TOGETHER: Final = 2**24
+_SAMPLES: Final = 2**24
 
 # Pixels from which the noise is estimated, and a clock is judged.
 _NOISE_PIXELS, _CLOCK_PIXELS = 4096, 256
 _NOISE_SAMPLES: Final = 2**19  # of a band, at most: fewer prove no larger noise than stated
 # Deviation from an even clock up to which times are not judged by the signals [mean step].
 _NEARLY_EVEN: Final = 1.0
-_READ: Final = ("counts", "status", "segment", "noise_factor", "pattern_std")
-_SEEN: Final = 4096  # pixels, about, by which a frame is seen to be measured
-_ROUNDED: Final = 1e-6  # negative eigenvalue of a covariance that is rounding [1]
+_VARIABLES: Final = ("counts", "status", "segment", "noise_factor", "pattern_std")
+_FRAME_PIXELS: Final = 4096  # pixels, about, by which a frame is seen to be measured
+_ROUNDING: Final = 1e-6  # negative eigenvalue of a covariance that is rounding [1]
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class Inputs:
     @property
     def frames(self) -> Mask:
         """Frames (time) that every band has, seen by some pixels."""
-        step = stride(self.capture["counts"].shape[2:], _SEEN)
+        step = stride(self.capture["counts"].shape[2:], _FRAME_PIXELS)
         measured = schema.measured(self.capture["counts"][:, :, ::step, ::step].values)
         return np.asarray(measured.any(axis=(2, 3)).all(axis=0))
 
@@ -116,7 +116,7 @@ class Inputs:
         """Rows that are read at once."""
         height = self.capture.sizes["y"]
         row = self.capture.sizes["time"] * self.capture.sizes["x"]
-        fitting = max(1, min(BLOCK_ROWS, _TOGETHER // row))
+        fitting = max(1, min(BLOCK_ROWS, _SAMPLES // row))
         rows = height if self.method.whole_image else fitting
         return [slice(top, min(top + rows, height)) for top in range(0, height, rows)]
 
@@ -125,10 +125,10 @@ def check_fields(settings: Any, method: str) -> None:
     """Refuse options of a method that are not of their stated types."""
     for field in fields(settings):
         value, kinds = getattr(settings, field.name), get_args(field.type) or (field.type,)
-        whole, real = isinstance(value, int | np.integer), isinstance(value, float | np.floating)
+        integer, real = isinstance(value, int | np.integer), isinstance(value, float | np.floating)
         fits = isinstance(value, kinds) or (value is None and NoneType in kinds)
         if {int, float} & {*kinds} and value is not None:
-            fits = (whole or (real and int not in kinds)) and type(value) is not bool
+            fits = (integer or (real and int not in kinds)) and type(value) is not bool
         if not fits:
             names = {int: "a whole number", float: "a number", bool: "a truth value", str: "text"}
             rule = " or ".join(names[kind] for kind in kinds if kind in names)
@@ -168,11 +168,11 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
     curves = responses.curves(response, bands, response_kind)
     if pool is not None and not method.pools:
         raise ValueError(f"Invalid pool for method '{name}', which does not pool.")
-    capture = corrected[[variable for variable in _READ if variable in corrected]]
+    capture = corrected[[variable for variable in _VARIABLES if variable in corrected]]
     if mask is not None:
         dims = ("time",), ("y", "x"), ("time", "y", "x")
-        used = _selection(capture, mask, "mask", "b", *dims)
-        capture = capture.assign(mask=used.drop_vars(list(used.coords)))
+        selection = _selection(capture, mask, "mask", "b", *dims)
+        capture = capture.assign(mask=selection.drop_vars(list(selection.coords)))
     response, noise = decide_noise(capture, response, curves)
     _check_clock(capture, method, curves, noise)
     stds = emissivity_std, emissivity_covariance
@@ -271,26 +271,26 @@ def decide_noise(
         if np.isnan(larger).all():
             return response.assign_attrs(noise_source="response"), stated
         noise = np.where(np.isnan(larger), stated, larger)
-        said = " and ".join(
-            f"{ratio * second:.3g} K in band '{name}', {ratio:.2g} times the stated {second:.3g} K"
-            for name, ratio, second in zip(names, larger / stated, stated, strict=True)
+        text = " and ".join(
+            f"{ratio * level:.3g} K in band '{name}', {ratio:.2g} times the stated {level:.3g} K"
+            for name, ratio, level in zip(names, larger / stated, stated, strict=True)
             if ratio > 1.0
         )
         doubt = "is the response of another integration time, or are two bands exchanged?"
-        response = warned(response, f"The noise of the capture, which is used, is {said}: {doubt}")
+        response = warned(response, f"The noise of the capture, which is used, is {text}: {doubt}")
     else:  # estimate it from the capture
         subsample, frames = quality.sample(capture, _NOISE_PIXELS)
         linear = [curve.linearise(band) for curve, band in zip(curves, subsample, strict=True)]
         noise = noises.estimate_bands(linear, capture["time"].values[frames])
-    used = "band", noise / factor * slopes, schema.NOISE.attrs
-    return response.sel(band=names).assign(noise=used).assign_attrs(noise_source="capture"), noise
+    array = "band", noise / factor * slopes, schema.NOISE.attrs
+    return response.sel(band=names).assign(noise=array).assign_attrs(noise_source="capture"), noise
 
 
 def _check_clock(capture: xr.Dataset, method: Method, curves: list[Curve], noise: Array) -> None:
     """Check a clock that is far from even by the signals, for a method that relies on it."""
     time = capture["time"].values.astype(np.float64)
-    off = np.abs(time - np.linspace(time[0], time[-1], time.size)).max() * (time.size - 1)
-    if method.check_clock is None or off <= _NEARLY_EVEN * (time[-1] - time[0]):
+    deviation = np.abs(time - np.linspace(time[0], time[-1], time.size)).max() * (time.size - 1)
+    if method.check_clock is None or deviation <= _NEARLY_EVEN * (time[-1] - time[0]):
         return
     counts, frames = quality.sample(capture, _CLOCK_PIXELS)
     if frames.sum() < method.minimum_frames:
@@ -330,30 +330,30 @@ def _known_emissivity(
         rule = "the same in both bands. Must differ; a gray body cannot be separated"
         raise ValueError(f"Invalid emissivities {values[:, 0, 0]}: {rule}.")
     if covariance is not None:
-        together = _over_image(corrected, covariance, "emissivity_covariance", "other_band")
-        least = np.linalg.eigvalsh(np.moveaxis(together, (0, 1), (-2, -1))).min()  # of one half
-        if not np.all(abs(together - together.swapaxes(0, 1)) <= _ROUNDED) or least < -_ROUNDED:
+        matrices = _over_image(corrected, covariance, "emissivity_covariance", "other_band")
+        least = np.linalg.eigvalsh(np.moveaxis(matrices, (0, 1), (-2, -1))).min()  # of one half
+        if not np.all(abs(matrices - matrices.swapaxes(0, 1)) <= _ROUNDING) or least < -_ROUNDING:
             rule = "Must be symmetric and have no negative eigenvalue"
             raise ValueError(f"Invalid emissivity_covariance. {rule}.")
-        return values, together
+        return values, matrices
     deviations = 0.0 * values if std is None else _over_image(corrected, std, "emissivity_std")
     if not np.all((deviations >= 0) & schema.measured(deviations)):
         raise ValueError("Invalid emissivity_std. Must be zero or positive, and finite.")
     return values, np.eye(len(values))[..., np.newaxis, np.newaxis] * deviations**2
 
 
-def _over_image(corrected: xr.Dataset, array: xr.DataArray, name: str, *second: str) -> Array:
+def _over_image(corrected: xr.Dataset, array: xr.DataArray, name: str, *dims: str) -> Array:
     """Values (band, ..., y, x) of an array over the bands, of one pixel or of all."""
-    allowed = ("band", *second), ("band", *second, "y", "x")
+    allowed = ("band", *dims), ("band", *dims, "y", "x")
     rule = f"Must be a DataArray of dims {allowed[0]} or {allowed[1]}, such as xr.DataArray("
-    rule += f"{[[0.86, 0.04], [0.04, 0.72]] if second else [0.86, 0.72]}, dims={[*allowed[0]]})"
+    rule += f"{[[0.86, 0.04], [0.04, 0.72]] if dims else [0.86, 0.72]}, dims={[*allowed[0]]})"
     if not isinstance(array, xr.DataArray):
         raise TypeError(f"Invalid {name} of type {type(array).__name__}. {rule}.")
     schema.check_numbers(array, name, "1")
     if array.dims not in allowed:
         raise ValueError(f"Invalid dims {array.dims} of {name}. {rule}.")
     array = laid_on(array, corrected, name, "the capture")
-    for dim in second:  # the same bands
+    for dim in dims:  # the same bands
         exchanged = array.rename({"band": dim, dim: "band"})
         array = laid_on(exchanged, corrected, name, "the capture")
     values = array.values.astype(np.float64)

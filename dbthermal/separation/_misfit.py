@@ -37,17 +37,17 @@ _BLOCK: Final = 4  # pixels along a side of what is averaged for changes
 _WINDOWS: Final = 4  # of some rows, that tell what a frame has in common
 # Blocks along a side of a neighbourhood, for changes and for events, whose blocks are wider: behind
 # a blur of 1.3 pixels in one band 0.87 of the intervals hold, in blocks as for changes 0.70.
-_AROUND, _AROUND_EVENTS, _WIDER = 5, 3, 2
+_SIDE, _EVENT_SIDE, _WIDER = 5, 3, 2
 # Samples of a row of a band, beyond which rows are not read two at a time: an hour of 640 columns
 # at 30 Hz takes 4.7 GB, not 5.7.
-_LONG: Final = 2**25
+_ROW_SAMPLES: Final = 2**25
 # Deviations of its noise from which a remainder counts; and of single pixels' means, share of their
 # noise. In plain scenes the bars stay as they are.
-_SURE, _ROUGH = 3.0, 0.1
+_SIGMAS, _SHARE = 3.0, 0.1
 # Share of a pixel's changes that are noise, at least, and their variance over that of all.
 _STEADY: Final = 0.8
 _OF_ALL: Final = float(chdtr(3, chdtri(1, 1.0 - _STEADY))) / _STEADY
-_MOVING: Final = 3.0  # variance of a reflection's changes in an event over their noise
+_CONTRAST: Final = 3.0  # variance of a reflection's changes in an event over their noise
 # Octaves of time in smooth functions, for the octave that is seen: 1/f noise is alike in all.
 _OCTAVES: Final = float(np.log2(smooth.HIGHEST_ORDER))
 
@@ -108,9 +108,9 @@ def measure(inputs: Inputs, result: xr.Dataset, workers: int, *probes: Probe) ->
         sums = [probe(inputs, result, reading) for probe in probes]
         return *_of_rows(inputs, result, reading), sums
 
-    is_long = inputs.capture["counts"][0, :, 0].size > _LONG
+    is_long = inputs.capture["counts"][0, :, 0].size > _ROW_SAMPLES
     with ThreadPoolExecutor(1 if is_long else workers) as threads:
-        sections, parts, common, sums = zip(*threads.map(examine, inputs.blocks), strict=True)
+        sections, parts, levels, sums = zip(*threads.map(examine, inputs.blocks), strict=True)
     blocks = _Blocks(*(np.concatenate(maps, axis=-2) for maps in zip(*sections, strict=True)))
     events = _Events(*(np.concatenate(maps, axis=-2) for maps in zip(*parts, strict=True)))
     answers = {
@@ -118,9 +118,9 @@ def measure(inputs: Inputs, result: xr.Dataset, workers: int, *probes: Probe) ->
         for probe, values in zip(probes, zip(*sums, strict=True), strict=False)
     }
     # Changes that no reflection explains; 1/f noise of single pixels, alike in all octaves.
-    sure = _SURE * np.sqrt(2.0 / (_number(blocks.pixels, _AROUND) * smooth.HIGHEST_ORDER))
+    sure = _SIGMAS * np.sqrt(2.0 / (_number(blocks.pixels, _SIDE) * smooth.HIGHEST_ORDER))
     change = _excess(blocks, blocks.rough, sure, 1.0)
-    single = np.minimum(*(_excess(blocks, it, _ROUGH, _OCTAVES) for it in blocks.single))
+    single = np.minimum(*(_excess(blocks, pair, _SHARE, _OCTAVES) for pair in blocks.single))
 
     def of_pixels(values: Array, side: int) -> Array:
         pairs = [(it.start, y // side) for it in inputs.blocks for y in range(it.stop - it.start)]
@@ -130,40 +130,40 @@ def measure(inputs: Inputs, result: xr.Dataset, workers: int, *probes: Probe) ->
     # Give each pixel the values of its block.
     leak = of_pixels(_leak(events), _WIDER * _BLOCK)
     change, single = (of_pixels(values, _BLOCK) for values in (change, single))
-    forms, forces = map(np.concatenate, zip(*common, strict=True))
+    forms, forces = map(np.concatenate, zip(*levels, strict=True))
     return Misfit(leak, change, single, answers, (forms, forces))
 
 
-def _local_mean(pixels: Array, values: Array, around: int) -> Array:
+def _local_mean(pixels: Array, values: Array, side: int) -> Array:
     """Mean (..., row, column) over the pixels of the blocks around each."""
-    size = (1,) * (values.ndim - 2) + (around, around)
-    weight = uniform_filter(pixels, around, mode="constant")
+    size = (1,) * (values.ndim - 2) + (side, side)
+    weight = uniform_filter(pixels, side, mode="constant")
     mean = uniform_filter(values * pixels, size, mode="constant")
     return np.asarray(quotient(mean, weight + 0.0 * mean, 0.0))
 
 
-def _number(pixels: Array, around: int) -> Array:
+def _number(pixels: Array, side: int) -> Array:
     """Blocks (row, column) around each that tell something."""
     counted = (pixels > 0).astype(np.float64)
-    number: Array = uniform_filter(counted, around, mode="constant") * around**2
+    number: Array = uniform_filter(counted, side, mode="constant") * side**2
     return np.maximum(number, 1.0)
 
 
 def _excess(blocks: _Blocks, variances: Array, least: Array | float, number: float) -> Array:
     """Deviation (row, column) [K] by a number of changes that exceed so much of their noise."""
-    variance, noise = _local_mean(blocks.pixels, variances, _AROUND)
-    more = np.maximum(variance - noise, 0.0)
-    return np.asarray(np.sqrt(np.where(more > least * noise, number * more, 0.0)))
+    variance, noise = _local_mean(blocks.pixels, variances, _SIDE)
+    excess = np.maximum(variance - noise, 0.0)
+    return np.asarray(np.sqrt(np.where(excess > least * noise, number * excess, 0.0)))
 
 
 def _leak(events: _Events) -> Array:
     """Deviation (row, column) of the share of the reflection that is left, over the events."""
-    cross, energy = _local_mean(events.pixels, events.products, _AROUND_EVENTS)
-    remainder, reflection, _ = _local_mean(events.pixels, events.noise, _AROUND_EVENTS)
-    freedom = _local_mean(events.pixels, events.freedom, _AROUND_EVENTS)
-    energy = np.where(energy > _MOVING * freedom * reflection, energy, 0.0)
+    cross, energy = _local_mean(events.pixels, events.products, _EVENT_SIDE)
+    remainder, reflection, _ = _local_mean(events.pixels, events.noise, _EVENT_SIDE)
+    freedom = _local_mean(events.pixels, events.freedom, _EVENT_SIDE)
+    energy = np.where(energy > _CONTRAST * freedom * reflection, energy, 0.0)
     share = quotient(cross, energy, 0.0)
-    number = _number(events.pixels, _AROUND_EVENTS)
+    number = _number(events.pixels, _EVENT_SIDE)
     noise = remainder * (energy + freedom * reflection) / number
     variance = quotient(noise, energy**2, 0.0)
     # Mean square of the events' shares, less noise, by the weight of each: what all events leave
@@ -171,7 +171,7 @@ def _leak(events: _Events) -> Array:
     weight = quotient(energy, energy.sum(axis=0) + 0.0 * energy, 0.0)
     scatter = (weight * (share**2 - variance)).sum(axis=0)
     doubt = np.sqrt(2.0 * ((weight * variance) ** 2).sum(axis=0))
-    return np.asarray(np.sqrt(np.where(scatter > _SURE * doubt, scatter, 0.0)))
+    return np.asarray(np.sqrt(np.where(scatter > _SIGMAS * doubt, scatter, 0.0)))
 
 
 def _block_sums(film: Array, width: int, side: int = _BLOCK) -> Array:
@@ -272,8 +272,8 @@ def _levels(
     windows = np.array_split(np.arange(noise.size).reshape(shape), _WINDOWS, axis=1)
     places = [window.ravel() for window in windows]
     force = np.zeros((_WINDOWS, len(weights), frames.size))
-    force[..., frames] = [precise[:, it] @ remainder[:, it].T for it in places]
-    return np.array([precise[:, it] @ weights[:, it].T for it in places]), force
+    force[..., frames] = [precise[:, place] @ remainder[:, place].T for place in places]
+    return np.array([precise[:, place] @ weights[:, place].T for place in places]), force
 
 
 def _single_pixels(
@@ -283,8 +283,8 @@ def _single_pixels(
     # Differences of neighbours, which have the object's rapid changes in common.
     column = np.arange(place.size - 1) % inputs.capture.sizes["x"]
     middle = np.flatnonzero(column % _BLOCK == 1)
-    alike = (place[middle - 1] == place[middle]) & (place[middle] == place[middle + 1])
-    middle = middle[alike & (place[middle] >= 0)]
+    mask = (place[middle - 1] == place[middle]) & (place[middle] == place[middle + 1])
+    middle = middle[mask & (place[middle] >= 0)]
     segment, length = schema.segments(inputs.capture)[frames], _length(len(frames)) // 2
     segments = segment[: len(segment) // length * length].reshape(-1, length)
 
@@ -293,7 +293,7 @@ def _single_pixels(
         squares = np.diff(films, 2, axis=0)[segments[:-2, 0] == segments[2:, -1]] ** 2
         smaller = np.sort(squares, axis=0)[: int(_STEADY * len(squares))]
         chosen = (squares, 36.0), (smaller, 36.0 * _OF_ALL)
-        return np.stack([it.sum(axis=0) / (times * max(len(it), 1)) for it, times in chosen])
+        return np.stack([data.sum(axis=0) / (times * max(len(data), 1)) for data, times in chosen])
 
     def compared(middle: Whole) -> list[Array]:
         values = np.zeros((len(segment), middle.size))
@@ -305,13 +305,13 @@ def _single_pixels(
 
     # Second differences in time, too, of means over some frames and of frames; none across a
     # shutter event. Of independent noise both have 36 times its variance.
-    squares = np.dstack([compared(it) for it in np.array_split(middle, _AROUND)]).swapaxes(0, 1)
+    squares = np.dstack([compared(it) for it in np.array_split(middle, _SIDE)]).swapaxes(0, 1)
     # Between frames that were interpolated in time, noise differs less than means of them tell.
     white = np.square(inputs.noise / schema.noise_factor(inputs.capture))
     rapid = white * np.square(inputs.capture.attrs.get("rapid_noise_factor", 1.0))
-    white, rapid = (it[inputs.bands] @ np.square(weights[:, middle]) for it in (white, rapid))
+    white, rapid = (term[inputs.bands] @ np.square(weights[:, middle]) for term in (white, rapid))
     squares[:, 1] *= quotient(white, rapid, 1.0)
-    sums = [[np.bincount(place[middle], it, blocks) for it in kinds] for kinds in squares]
+    sums = [[np.bincount(place[middle], values, blocks) for values in kinds] for kinds in squares]
     return np.array(sums) / np.maximum(np.bincount(place[middle], minlength=blocks), 1.0)
 
 
@@ -357,10 +357,10 @@ def object_weights(inputs: Inputs, result: xr.Dataset) -> Array:
     """Weights (band, y, x) of the bands, in their order, for the object's signal."""
     ratio = result["reflection_ratio"].values[inputs.bands]
     sound = (result["status"].values == 0) & np.isfinite(ratio).all(axis=0)
-    every = np.zeros(ratio.shape)
+    weights = np.zeros(ratio.shape)
     noise = np.tile(inputs.noise[inputs.bands, np.newaxis], np.count_nonzero(sound))
-    every[:, sound] = _weights(ratio[:, sound], noise)[0]
-    return every[np.argsort(inputs.bands)]
+    weights[:, sound] = _weights(ratio[:, sound], noise)[0]
+    return weights[np.argsort(inputs.bands)]
 
 
 def _length(frames: int) -> int:
@@ -373,18 +373,18 @@ def _weights(ratio: Array, deviation: Array) -> tuple[Array, Array]:
     contrast = (1.0 - ratio[1:]) / ratio[1:]
     weights = contrast / ((deviation[1:] / ratio[1:]) ** 2 + deviation[0] ** 2)
     weights /= np.sum(weights * contrast, axis=0)
-    every = np.concatenate([-weights.sum(axis=0, keepdims=True), weights / ratio[1:]])
-    total, first = np.sum((every * deviation) ** 2, axis=0), deviation[0] ** 2
+    result = np.concatenate([-weights.sum(axis=0, keepdims=True), weights / ratio[1:]])
+    total, first = np.sum((result * deviation) ** 2, axis=0), deviation[0] ** 2
     # Variances of the weighted sum and of the reflection, and their covariance [K^2].
-    return every, np.stack([total, first, every[0] * first])
+    return result, np.stack([total, first, result[0] * first])
 
 
 def widen(inputs: Inputs, result: xr.Dataset, misfit: Misfit) -> None:
     """Widen the deviations of a result by what the model leaves, in place."""
-    first = inputs.bands[0]
-    emissivity, ratio = result["emissivity"].values[first], result["reflection_ratio"].values
-    everything = np.maximum(misfit.change, misfit.single)
-    sound = (result["status"].values == 0) & ((misfit.leak > 0.0) | (everything > 0.0))
+    reference = inputs.bands[0]
+    emissivity, ratio = result["emissivity"].values[reference], result["reflection_ratio"].values
+    deviation = np.maximum(misfit.change, misfit.single)
+    sound = (result["status"].values == 0) & ((misfit.leak > 0.0) | (deviation > 0.0))
     # Of the ratios, whose error makes a leak, and of the emissivities that follow from them.
     ratios = np.where(sound, misfit.leak * (1.0 - ratio), 0.0)
     emissivities = (1.0 - emissivity) * ratios
@@ -394,11 +394,11 @@ def widen(inputs: Inputs, result: xr.Dataset, misfit: Misfit) -> None:
         result[name].values[:] = np.where(sound, np.hypot(result[name].values, added), result[name])
     # Of the object in every frame, and of the reflection beside it.
     films = [result[name].values for name in FILMS]
-    curve = inputs.curves[first]
+    curve = inputs.curves[reference]
     for row in map(int, np.flatnonzero(sound.any(axis=1))):
         columns = np.flatnonzero(sound[row])
         chosen = [film[:, row].take(columns, axis=1).astype(np.float64) for film in films]
-        leak, change = misfit.leak[row, columns], everything[row, columns]
+        leak, change = misfit.leak[row, columns], deviation[row, columns]
         share = emissivity[row, columns]
         counted = np.isfinite(chosen[0]).sum(axis=0)
         mean = quotient(np.nansum(chosen[0], axis=0), counted, curve.reference)

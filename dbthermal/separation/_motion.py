@@ -49,16 +49,16 @@ from dbthermal.separation._overlay import (
 )
 
 # Prior deviations [pixel] of rapid motion that the bands share, or do not; and of slow motion.
-_COMMON, _APART, _TURN = 3.0, 0.1, 1.0
+_JOINT_STD, _BAND_STD, _TURN = 3.0, 0.1, 1.0
 # Square of rapid motion over its variance by a jackknife of windows, median over the frames, from
 # which it is undone: at most 2 without any, 4.5 where heat spreads; 9 to 28 of 0.3 pixel, 7 to 10
 # of a turn by 0.6 degrees.
 _SHAKEN: Final = 6.0
 _SLOW: Final = 3  # smooth functions in which the image's gradients change
-_LEAST: Final = 0.1  # motion of a band that matters, rms [pixel]: two depths feign 0.06
+_THRESHOLD: Final = 0.1  # motion of a band that matters, rms [pixel]: two depths feign 0.06
 # Of rapid motion: side of a window, least and most, and what is read around it [pixel]; samples of
 # a band at most; number of steps, the longest, and their rms that ends them [pixel].
-_SIDES, _AROUND, _SAMPLES = (8, 32), 6, 2**24
+_SIDES, _MARGIN, _SAMPLES = (8, 32), 6, 2**24
 _TURNS, _STEP, _SETTLED = 6, 2.0, 0.02
 _SEARCHED, _REPEATS = 2, 2  # turns in which ratios are sought, and rounds of the weights
 # Ratios that are tried, of reflectivities; and the variance over that of noise of a pixel that
@@ -68,7 +68,7 @@ _HALF: Final = 4.0
 # Flags that motion brings about, and the share of the pixels that have them, or a remainder: of
 # plain scenes up to 0.05 have it.
 _DISTURBED: Final = Status.OBJECT_NOT_SMOOTH | Status.OBJECT_JUMP | Status.BANDS_APART
-_MANY: Final = 0.1
+_SHARE: Final = 0.1
 # Of slow motion: polynomials of the time, windows along a side of the image, and frames at most. As
 # the slower weigh more, a drift of one pixel shows a square of 30 to 138 in six scenes; 108 scenes
 # without, of 18 situations, at most 11; 30 of 24x32 pixels up to 93, but of less than 0.06 pixel.
@@ -96,8 +96,8 @@ class Stabilised(Moved):
             ("The level of whole frames varied", "K", np.std(self.levels, axis=1)),
         ):
             pairs = zip(self.capture["band"].values, sizes, strict=True)
-            every = ", ".join(f"'{band}' {size:.2g}" for band, size in pairs)
-            texts += [f"{text}, by {every} {unit} (rms)"] if np.any(sizes) else []
+            values = ", ".join(f"'{band}' {size:.2g}" for band, size in pairs)
+            texts += [f"{text}, by {values} {unit} (rms)"] if np.any(sizes) else []
         outcome = "was undone" if undone else "could not be undone: intervals may be too small"
         return f"{'; '.join(texts)}, which {outcome}."
 
@@ -112,9 +112,9 @@ def stabilise(
     """Move each frame back by the cameras' motion, less its level; None if there is neither."""
     shape, status = corrected["counts"].shape, result["status"].values
     steps, slow = np.zeros((*shape[:2], PARAMETERS)), np.zeros(PARAMETERS)
-    disturbed = np.mean((status & np.uint32(_DISTURBED)) != 0) > _MANY
+    disturbed = np.mean((status & np.uint32(_DISTURBED)) != 0) > _SHARE
     remainder = ((misfit.leak > 0.0) | (misfit.change > 0.0)) & (status == 0)
-    if before is None and (disturbed or remainder.sum() > _MANY * np.count_nonzero(status == 0)):
+    if before is None and (disturbed or remainder.sum() > _SHARE * np.count_nonzero(status == 0)):
         steps = _rapid(corrected, inputs)
         # In the smooth functions as much motion is expected as in the next octave of time.
         time = inputs.capture["time"].values.astype(np.float64)
@@ -124,7 +124,7 @@ def stabilise(
     steps[..., :2] += _slow(inputs, misfit)
     levels, wander = _levels(inputs, misfit)
     motion = steps if before is None else steps + before.motion
-    if not np.any(steps) or max(map(size_of, motion)) < _LEAST:
+    if not np.any(steps) or max(map(size_of, motion)) < _THRESHOLD:
         motion, slow = motion - steps, 0.0 * slow
         if not levels.any():
             return None
@@ -183,7 +183,7 @@ def _rapid(corrected: xr.Dataset, inputs: Inputs) -> Array:
         return motion
     windows = list(_windows(films, inputs, frames))
     basis = smooth_functions(inputs.capture, frames).functions
-    prior = _COMMON**2 * np.ones((len(bands), len(bands))) + _APART**2 * np.eye(len(bands))
+    prior = _JOINT_STD**2 * np.ones((len(bands), len(bands))) + _BAND_STD**2 * np.eye(len(bands))
     precision = np.kron(np.linalg.inv(prior), np.eye(PARAMETERS))
     path = np.zeros((len(bands), len(basis), PARAMETERS))
     for turn in range(_TURNS):
@@ -194,7 +194,7 @@ def _rapid(corrected: xr.Dataset, inputs: Inputs) -> Array:
             _equations(inputs, changes, ratio, place, basis, _REPEATS)
             for place, ratio in enumerate(ratios, 1)
         ]
-        form, force = (np.sum([pair[it] for pair in pairs], axis=0) for it in (0, 1))
+        form, force = (np.sum([pair[index] for pair in pairs], axis=0) for index in (0, 1))
         # Is there motion? A growth is no evidence: spreading heat feigns growth, with up to 76.
         before = np.swapaxes(path, 0, 1).reshape(len(basis), -1)
         steps, variance = jackknife(form, force, precision, before)
@@ -206,8 +206,8 @@ def _rapid(corrected: xr.Dataset, inputs: Inputs) -> Array:
         if np.sqrt(np.mean(steps**2)) < _SETTLED:
             break
     # The motion of lost frames is interpolated between the frames before and after.
-    every, places = np.arange(frames.size), np.flatnonzero(frames)
-    motion[bands] = np.apply_along_axis(lambda course: np.interp(every, places, course), 1, path)
+    times, places = np.arange(frames.size), np.flatnonzero(frames)
+    motion[bands] = np.apply_along_axis(lambda course: np.interp(times, places, course), 1, path)
     return motion
 
 
@@ -215,22 +215,22 @@ def _windows(films: xr.DataArray, inputs: Inputs, frames: Mask) -> Iterator[_Win
     """Yield windows of the image, of some frames (time), without gaps."""
     good, sides = inputs.good, []
     places = places_of(good.shape)
-    longest = np.sqrt(_SAMPLES / np.count_nonzero(frames)) / _WINDOWS - 2 * _AROUND
+    longest = np.sqrt(_SAMPLES / np.count_nonzero(frames)) / _WINDOWS - 2 * _MARGIN
     for size in good.shape:
         side = max(1, min(int(np.clip(longest, *_SIDES)), size // _WINDOWS))
         starts = np.linspace(0, size - side, min(_WINDOWS, size)).astype(int)
         sides.append([slice(start, start + side) for start in starts])
     for y, x in product(*sides):
-        margin = tuple(slice(max(0, it.start - _AROUND), it.stop + _AROUND) for it in (y, x))
-        used = np.zeros(good.shape, dtype=bool)
-        used[y, x] = good[y, x]
+        margin = tuple(slice(max(0, span.start - _MARGIN), span.stop + _MARGIN) for span in (y, x))
+        mask = np.zeros(good.shape, dtype=bool)
+        mask[y, x] = good[y, x]
         counts = films.values[..., margin[0], margin[1]][inputs.bands][:, frames]
         signals = np.empty(counts.shape)
         for signal, film, band in zip(signals, counts, inputs.bands, strict=True):
             for frame, image in zip(signal, inputs.curves[band].linearise(film), strict=True):
                 valid = good[margin] & np.isfinite(image)
                 frame[:] = without_gaps(image - inputs.curves[band].reference, valid)
-        yield _Window(signals, used[margin], places[:, *margin])
+        yield _Window(signals, mask[margin], places[:, *margin])
 
 
 def _changes(window: _Window, path: Array, basis: Array) -> _Changes:
@@ -287,7 +287,7 @@ def _equations(
             pull -= pull @ basis @ basis.T
             forces.append(np.einsum("tj,ajt->ta", course, pull))
         form, force = np.array(forms), np.array(forces)
-        steps = solved(form.sum(axis=0) + np.eye(form.shape[-1]) / _COMMON**2, force.sum(axis=0))
+        steps = solved(form.sum(axis=0) + np.eye(form.shape[-1]) / _JOINT_STD**2, force.sum(axis=0))
         moved = np.einsum("ta,tj->taj", steps, course).reshape(len(steps), -1)
         energies = []
         for null, slope in combinations:
@@ -302,17 +302,17 @@ def _slow(inputs: Inputs, misfit: Misfit) -> Array:
     time = inputs.capture["time"].values.astype(np.float64)
     motion, windows = np.zeros((len(inputs.bands), time.size, 2)), misfit.answers[drift]
     # A delay, which feigns motion of what walks by, is that of clocks: it hardly changes.
-    wanted = np.ones((_DEGREES + 1, 3), dtype=bool)
-    wanted[2:, 2] = False
+    terms = np.ones((_DEGREES + 1, 3), dtype=bool)
+    terms[2:, 2] = False
     for place, band in enumerate(inputs.bands[1:]) if windows else ():
-        form, force = (np.concatenate([sums[place][it] for sums in windows]) for it in (0, 1))
-        form, force = form[:, wanted.ravel()][..., wanted.ravel()], force[:, wanted.ravel()]
+        form, force = (np.concatenate([sums[place][index] for sums in windows]) for index in (0, 1))
+        form, force = form[:, terms.ravel()][..., terms.ravel()], force[:, terms.ravel()]
         steps, variance = jackknife(
             form, force, np.eye(form.shape[1]) / _TURN**2, np.zeros(form.shape[1])
         )
         # What does not change in time is no motion.
-        score, path = np.zeros((2, *wanted.shape))
-        score[wanted], path[wanted] = quotient(steps**2, variance, 0.0), steps
+        score, path = np.zeros((2, *terms.shape))
+        score[terms], path[terms] = quotient(steps**2, variance, 0.0), steps
         slowness = 1.0 / np.arange(1, _DEGREES + 1)
         if np.any(np.average(score[1:, :2], axis=0, weights=slowness) > SURE):
             motion[band] = _course(time)[:, 1:] @ path[1:, :2]
@@ -350,12 +350,12 @@ def drift(inputs: Inputs, result: xr.Dataset, reading: Reading) -> list[tuple[Ar
     slopes = np.stack([*np.gradient(first, axis=(1, 2)), in_time])
     equations = []
     for place, ratio in enumerate(ratios[1:], 1):
-        used = binary_erosion(pixels & (ratio > 0.0), border_value=1)
-        kappa, forms, forces = np.where(used, ratio, 1.0), list[Array](), list[Array]()
-        weighted = slopes * (used / (noise[0] + noise[place] / kappa**2))
-        every = weighted, slopes, rapid(place, at) / kappa - first
-        for parts in zip(*(np.array_split(it, _WINDOWS, axis=-1) for it in every), strict=True):
-            pull, slope, remainder = (it.reshape(*it.shape[:-2], -1) for it in parts)
+        mask = binary_erosion(pixels & (ratio > 0.0), border_value=1)
+        kappa, forms, forces = np.where(mask, ratio, 1.0), list[Array](), list[Array]()
+        weighted = slopes * (mask / (noise[0] + noise[place] / kappa**2))
+        terms = weighted, slopes, rapid(place, at) / kappa - first
+        for group in zip(*(np.array_split(term, _WINDOWS, axis=-1) for term in terms), strict=True):
+            pull, slope, remainder = (term.reshape(*term.shape[:-2], -1) for term in group)
             form = pull.swapaxes(0, 1) @ slope.transpose(1, 2, 0)
             force = np.einsum("atp,tp->ta", pull, remainder)
             forms.append(np.einsum("tj,tk,tab->jakb", course, course, form, optimize=True))

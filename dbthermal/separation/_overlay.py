@@ -33,21 +33,21 @@ SURE: Final = 20.0
 # object's detail, 0.2 or more of people who walk by slowly. A lamp that is switched is as slow, but
 # the largest energy of more functions is 0.23 of the first kind or more in all of its windows, and
 # at most 0.18 in half of an object's.
-_ORDER, _HIGHEST, _RAPID, _ALL, _LAMP = 3, 8, 0.1, 16, 0.2
+_ORDER, _HIGHEST, _RAPID, _FUNCTIONS, _LAMP = 3, 8, 0.1, 16, 0.2
 _SIDE, _DEGREE = 10, 3  # of a window [pixel], and of the polynomial that is smooth in it
 _BLURS: Final = (2.0, 1.0, 0.5)  # deviations, from coarse to fine [pixel]
 # Whole displacements [pixel] that are tried first, along an axis; and what of the most in common
 # is nearly as much, so that no displacement by a period of a pattern is preferred to none.
 _REACH, _NEARLY = 4, 0.9
-_MOST, _FEWEST = 64, 4  # windows, of most detail; with detail that both bands show, at least
+_WINDOWS, _FEWEST = 64, 4  # windows, of most detail; with detail that both bands show, at least
 # Share of a window's detail that the bands have in common, at least; and share of all else that a
 # displacement leaves at the best blur, at most, by so much less per pixel; at each blur less than
 # all. So 18 of 24 scenes are displaced by 0.3 pixel and 72 of 72 by 1 or 2, and of 260 smooth
 # objects none, of which noise that looks alike at the finest blur alone displaced 23.
-_ALIKE, _LEFT, _FALL = 0.5, 0.9, 0.25
+_SHARE, _REMAINDER, _FALL = 0.5, 0.9, 0.25
 _PRIOR: Final = 2.0  # deviation [pixel] of a parameter
 _TURNS, _SETTLED, _STEP = 8, 0.01, 1.0  # steps at most; rms that ends them; longest [pixel]
-_LEAST: Final = 0.1  # displacement that matters, rms along an axis [pixel]
+_THRESHOLD: Final = 0.1  # displacement that matters, rms along an axis [pixel]
 # Orthonormal polynomials (pixel, power) of the places in a window.
 _PLACES: Final = np.indices((_SIDE, _SIDE)).reshape(2, -1) / _SIDE - 0.5
 _POWERS: Final = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
@@ -115,7 +115,7 @@ def moved(corrected: xr.Dataset, inputs: Inputs, motion: Array) -> xr.Dataset:
     """Capture whose frames are moved (band, time, parameter) [pixel], or all of a band alike."""
     shape = corrected["counts"].shape
     counts, good = empty(shape, np.float32), inputs.good
-    places, last = places_of(shape[2:]), np.reshape(shape[2:], (2, 1, 1)) - 1.0
+    places, end = places_of(shape[2:]), np.reshape(shape[2:], (2, 1, 1)) - 1.0
     motion = np.broadcast_to(motion, (*shape[:2], PARAMETERS))
     for film, images, path in zip(counts, corrected["counts"].values, motion, strict=True):
         for frame, image, step in zip(film, images, path, strict=True):
@@ -125,7 +125,7 @@ def moved(corrected: xr.Dataset, inputs: Inputs, motion: Array) -> xr.Dataset:
             valid, sources = good & np.isfinite(image), sources_of(step, places)
             frame[valid] = resampled(without_gaps(image, valid), sources)[valid]
             # What was outside of the image was not seen.
-            outside = np.any((sources < -_LEAST) | (sources > last + _LEAST), axis=0)
+            outside = np.any((sources < -_THRESHOLD) | (sources > end + _THRESHOLD), axis=0)
             frame[outside & good] = np.nan
         release()
     return corrected.assign(counts=corrected["counts"].copy(data=counts))
@@ -138,9 +138,9 @@ def solved(form: Array, force: Array) -> Array:
 def jackknife(form: Array, force: Array, prior: Array, before: Array) -> tuple[Array, Array]:
     """Solution of normal equations (window, ...) with a prior, and its variance by a jackknife."""
     # The prior is on the sum of this solution and what was solved before.
-    whole, total = form.sum(axis=0) + prior, force.sum(axis=0) - before @ prior
-    reduced = solved(whole - form, total - force)
-    return solved(whole, total), np.var(reduced, axis=0) * (len(reduced) - 1)
+    matrix, total = form.sum(axis=0) + prior, force.sum(axis=0) - before @ prior
+    reduced = solved(matrix - form, total - force)
+    return solved(matrix, total), np.var(reduced, axis=0) * (len(reduced) - 1)
 
 
 @dataclass(frozen=True)
@@ -193,15 +193,15 @@ def overlay(corrected: xr.Dataset, inputs: Inputs) -> Laid | None:
 def _slow_maps(corrected: xr.Dataset, inputs: Inputs, frames: Whole) -> tuple[Array, Array]:
     """Maps (band, function, y, x) [K] of slow functions of time in some frames; their drift."""
     counts, good = corrected["counts"], inputs.good
-    course = smooth.polynomial_basis(corrected["time"].values[frames], _ALL)
+    course = smooth.polynomial_basis(corrected["time"].values[frames], _FUNCTIONS)
     slow = course[:, :_ORDER]
     # What a drift along time brings of each (..., function) into the functions without the mean.
     drift = (slow[:, 1:] * slow[:, [1]]).T @ slow / np.abs(slow[:, 1]).max()
     weights, span = course.T.astype(np.float32), slice(frames[0], frames[-1] + 1)
-    used = span if span.stop - span.start == frames.size else frames
-    maps = np.zeros((len(inputs.bands), _ALL, *good.shape))
+    selection = span if span.stop - span.start == frames.size else frames
+    maps = np.zeros((len(inputs.bands), _FUNCTIONS, *good.shape))
     for rows in inputs.blocks:
-        films = counts[:, used, rows].values
+        films = counts[:, selection, rows].values
         for rise, band in zip(maps, inputs.bands, strict=True):
             rise[:, rows] = np.tensordot(weights, films[band], 1)
             rise[:, rows] /= inputs.curves[band].reference_slope
@@ -237,11 +237,11 @@ class _Views:
 
     def nearest(self) -> Array:
         """Least whole displacement (parameter) at which the bands have nearly most in common."""
-        last = np.reshape(self.images.shape[1:], (2, 1, 1)) - 1
+        end = np.reshape(self.images.shape[1:], (2, 1, 1)) - 1
         trials = np.indices((2 * _REACH + 1,) * 2).reshape(2, -1, 1, 1) - _REACH
         common = []
         for displacement in trials.swapaxes(0, 1):
-            sources = np.clip(self.pixels - displacement, 0, last)
+            sources = np.clip(self.pixels - displacement, 0, end)
             values = _detail(self.images[:, *sources])
             shared = np.sum(self.detail * values, axis=(0, 2))
             energy = self.energy * np.sum(values**2, axis=(0, 2))
@@ -257,14 +257,14 @@ class _Views:
         images = [map_coordinates(spline, sources, **options) for spline in self.splines]
         values = _detail(np.array(images))
         shared = np.sum(self.detail * values, axis=(0, 2))
-        alike = shared**2 > _ALIKE * self.energy * np.sum(values**2, axis=(0, 2))
+        windows = shared**2 > _SHARE * self.energy * np.sum(values**2, axis=(0, 2))
         scale = quotient(shared, self.energy, 0.0)
-        return scale, values - scale[:, np.newaxis] * self.detail, alike
+        return scale, values - scale[:, np.newaxis] * self.detail, windows
 
 
 def _displacement(first: Array, second: Array, drift: Array, noise: Array) -> tuple[Array, Array]:
     """Motion (parameter) [pixel] that lays maps (function, y, x) on the first, and its variance."""
-    none = np.zeros(PARAMETERS)
+    zero = np.zeros(PARAMETERS)
     # Choose the windows of most detail, which changes as the object does: all in slow functions.
     height, width = (size // _SIDE for size in first.shape[1:])
     corners = np.indices((height, width)).reshape(2, -1, 1) * _SIDE
@@ -272,54 +272,54 @@ def _displacement(first: Array, second: Array, drift: Array, noise: Array) -> tu
     smoothed = gaussian_filter(first[1:], _BLURS[0], axes=(1, 2))
     energy = np.sum(_detail(smoothed[:, *pixels]) ** 2, axis=2)
     slow, rapid = energy[: _ORDER - 1].mean(axis=0), energy[_ORDER - 1 :]
-    used = rapid[: _HIGHEST - _ORDER].mean(axis=0) < _RAPID * slow
-    if np.count_nonzero(used & (rapid.max(axis=0) < _LAMP * slow)) < _FEWEST:
-        return none, none
-    pixels, most = pixels[:, used], np.argsort(slow[used])[-_MOST:]
+    mask = rapid[: _HIGHEST - _ORDER].mean(axis=0) < _RAPID * slow
+    if np.count_nonzero(mask & (rapid.max(axis=0) < _LAMP * slow)) < _FEWEST:
+        return zero, zero
+    pixels, order = pixels[:, mask], np.argsort(slow[mask])[-_WINDOWS:]
     first, second = first[:_ORDER], second[:_ORDER]
-    path, levels, finest = none, list[_Views](), None
+    path, levels, finest = zero, list[_Views](), None
     # From coarse detail to fine, as far as both bands show it.
     for blur in _BLURS:
-        views = _Views(first, second, drift, pixels[:, most], blur)
+        views = _Views(first, second, drift, pixels[:, order], blur)
         # Few coarse windows may lead astray: begin where most show the same.
         start = max((path, views.nearest()), key=lambda it: np.count_nonzero(views.compared(it)[2]))
         level = _refined(views, start, noise**2 / (4.0 * np.pi * blur**2))
         if level is None:
             break
         levels.append(views)
-        path, spread, alike = level
+        path, spread, windows = level
         # The coarsest detail tells where to begin; finer detail counts if most windows show it
         # (with fewer, 1 of 400 scenes was moved that lay right), or if it is the finest.
-        if blur == _BLURS[-1] or (blur < _BLURS[0] and np.mean(alike) > 0.5):
+        if blur == _BLURS[-1] or (blur < _BLURS[0] and np.mean(windows) > 0.5):
             finest = path, spread
     if finest is None:
-        return none, none
+        return zero, zero
     path, spread = finest
     # Compare what the bands do not have in common with the motion and without it, in all windows,
     # most of which a motion of reflections spoils.
-    after, before = ([np.sum(it.compared(at)[1] ** 2) for it in levels] for at in (path, none))
-    shares = quotient(np.array(after), np.array(before), 1.0)
-    explained = shares.max() < 1.0 and shares.min() < _LEFT - _FALL * size_of(path)
+    squares = [[np.sum(it.compared(shift)[1] ** 2) for it in levels] for shift in (path, zero)]
+    shares = np.divide(squares[0], squares[1])
+    explained = shares.max() < 1.0 and shares.min() < _REMAINDER - _FALL * size_of(path)
     # A growth is no evidence: heat that spreads feigns it.
     sure = np.any(quotient(path**2, spread, 0.0)[:-1] > SURE)
     # No motion that is unsure, too small to matter, or does not explain the difference.
-    return (path, spread) if sure and explained and size_of(path) > _LEAST else (none, none)
+    return (path, spread) if sure and explained and size_of(path) > _THRESHOLD else (zero, zero)
 
 
 def _refined(views: _Views, path: Array, variance: Array) -> tuple[Array, Array, Mask] | None:
     """Motion (parameter) [pixel] by Gauss-Newton, its variance, and windows alike; None of few."""
     for _ in range(_TURNS):
-        scale, remainder, alike = views.compared(path)
-        if np.count_nonzero(alike) < _FEWEST:
+        scale, remainder, windows = views.compared(path)
+        if np.count_nonzero(windows) < _FEWEST:
             return None
         least = variance[1] + scale**2 * variance[0]
-        weight = (scale / np.maximum(np.mean(remainder**2, axis=(0, 2)), least))[alike]
-        slopes, residual = views.slopes[:, :, alike], remainder[:, alike]
-        form = np.einsum("w,afwp,bfwp->wab", weight * scale[alike], slopes, slopes)
+        weight = (scale / np.maximum(np.mean(remainder**2, axis=(0, 2)), least))[windows]
+        slopes, residual = views.slopes[:, :, windows], remainder[:, windows]
+        form = np.einsum("w,afwp,bfwp->wab", weight * scale[windows], slopes, slopes)
         force = np.einsum("w,afwp,fwp->wa", weight, slopes, residual)
         prior, before = np.eye(len(slopes)) / _PRIOR**2, np.append(path, [0.0, 0.0])
         step, spread = (values[:PARAMETERS] for values in jackknife(form, force, prior, before))
         path = path + np.clip(step, -_STEP, _STEP)
         if np.sqrt(np.mean(step**2)) < _SETTLED:
             break
-    return path, spread, alike
+    return path, spread, windows

@@ -74,7 +74,7 @@ def read(
     bands = zip(counts, levels, ends, strict=True)
     saturated = [samples.heaped(band, valid, grain, end) for band, grain, end in bands]
     same = [samples.repeated(band, valid) for band in counts]
-    frozen, copied = _frozen(same, valid, [it.chance for it in levels])
+    frozen, copied = _frozen(same, valid, [grain.chance for grain in levels])
     valid &= ~copied[:, np.newaxis]
     counts = _kept(counts, valid).astype(np.float64)
     frames = samples.counted(valid)
@@ -133,10 +133,10 @@ def bridge(counts: Array, valid: Mask, time: Array) -> tuple[Array, Mask]:
     # background.
     longest = max(LONGEST_GAP, int(LONGEST_SHARE * len(valid)))
     short = after - before <= longest + 1
-    frame, pixel, first, last = (band[short] for band in (frame, pixel, before, after))
-    share = (time[frame] - time[first]) / (time[last] - time[first])
+    frame, pixel, start, end = (band[short] for band in (frame, pixel, before, after))
+    share = (time[frame] - time[start]) / (time[end] - time[start])
     filled = counts.copy()
-    line = (1.0 - share) * counts[:, first, pixel] + share * counts[:, last, pixel]
+    line = (1.0 - share) * counts[:, start, pixel] + share * counts[:, end, pixel]
     filled[:, frame, pixel] = line
     bridged = valid.copy()
     bridged[frame, pixel] = True
@@ -152,8 +152,8 @@ def frame_sets(valid: Mask, status: Bits) -> Iterator[tuple[Mask, Mask]]:
         yield np.ones(valid.shape[0], dtype=bool), usable
         return
     packed = np.packbits(valid, axis=0)
-    _, first, group = np.unique(packed, axis=1, return_index=True, return_inverse=True)
-    for index, pixel in enumerate(first):
+    _, places, group = np.unique(packed, axis=1, return_index=True, return_inverse=True)
+    for index, pixel in enumerate(places):
         pixels = (group.ravel() == index) & usable
         if np.any(pixels):
             yield valid[:, pixel], pixels
@@ -182,14 +182,14 @@ def sample(corrected: xr.Dataset, pixels: int, *, bridged: bool = False) -> tupl
         pixels = max(1, pixels * _LONG // (4 * length))
     step = stride((corrected.sizes["y"], corrected.sizes["x"]), pixels)
     # Pixels on an even grid, at the frames that most of them have.
-    every = slice(None, None, step)
-    counts, valid, status = read(corrected.isel(y=every, x=every))
+    grid = slice(None, None, step)
+    counts, valid, status = read(corrected.isel(y=grid, x=grid))
     # Good pixels have no bit but that of frozen frames.
     good = (status & ~np.uint32(Status.FROZEN_FRAMES)) == 0
     frames = np.mean(valid[:, good], axis=1) > MOST_MISSING if np.any(good) else good[:0]
-    whole = good & np.all(valid[frames], axis=0) if np.any(good) else good
-    if whole.any() or not (bridged and good.any()):
-        return counts[:, frames][:, :, whole], frames
+    mask = good & np.all(valid[frames], axis=0) if np.any(good) else good
+    if mask.any() or not (bridged and good.any()):
+        return counts[:, frames][:, :, mask], frames
     # Where no pixel has all of these frames, those that lack few are bridged, if asked.
     good &= np.mean(valid[frames], axis=0) > 1.0 - MOST_BRIDGED
     films = np.where(valid, counts, np.nan)[:, frames][:, :, good]

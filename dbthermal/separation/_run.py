@@ -187,14 +187,14 @@ def _separate_capture(
         content = _content(source, capture, read, executor or pool)
     response = checked.response  # with one noise for all blocks
     digest = _digest([content, response, plan.method, plan.options])
-    made = json.loads(json.dumps({**(provenance or store.provenance({})), "run": digest}))
+    record = json.loads(json.dumps({**(provenance or store.provenance({})), "run": digest}))
     # Leave a result of the same run; go on with its parts.
     folder = Path(f"{target}.parts")
-    if target.exists() and store.open_dataset(target).attrs.get("provenance") == made:
+    if target.exists() and store.open_dataset(target).attrs.get("provenance") == record:
         shutil.rmtree(folder, ignore_errors=True)  # of a run that was killed at its very end
         return
-    plan = replace(plan, response=response, height=height, provenance=made)
-    _begin(folder, {"height": height, **made})
+    plan = replace(plan, response=response, height=height, provenance=record)
+    _begin(folder, {"height": height, **record})
     image = capture.sizes["y"]
     paths = {top: folder / f"{top:06d}.zarr" for top in range(0, image, height)}
     # Separate the blocks that are missing, those of one reading together.
@@ -248,7 +248,7 @@ def _pairs(source: Any, target: Any) -> list[tuple[Path | xr.Dataset, Path]]:
     captures = [
         it if isinstance(it, xr.Dataset) else texts.as_path(it).absolute() for it in sources
     ]
-    named = [*places, *(it for it in captures if isinstance(it, Path))]
+    named = [*places, *(capture for capture in captures if isinstance(capture, Path))]
     for place in places:
         if place.suffix != ".zarr" or named.count(place) > 1:
             rule = "Must end in '.zarr', be no capture that is read, and be named once"
@@ -318,10 +318,10 @@ def _content(source: Path | xr.Dataset, capture: xr.Dataset, read: int, executor
     if isinstance(source, Path) and (sums := last_sums(source)):
         return sums
     films = [name for name, variable in capture.variables.items() if "y" in variable.dims]
-    constant, every = capture.drop_vars(films), capture.drop_vars(capture.variables.keys() - films)
+    constant, movie = capture.drop_vars(films), capture.drop_vars(capture.variables.keys() - films)
     heights = capture["counts"].chunksizes.get("y") or [read] * math.ceil(capture.sizes["y"] / read)
     ends = zip(accumulate(heights), heights, strict=True)
-    blocks = [every.isel(y=slice(end - height, end)) for end, height in ends]
+    blocks = [movie.isel(y=slice(end - height, end)) for end, height in ends]
     in_memory = all(array.variable._in_memory for array in capture.values())
     digests = map(_row_digests, blocks) if in_memory else executor.map(_row_digests, blocks)
     return [_digest(constant), "".join(digests)]

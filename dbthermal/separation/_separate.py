@@ -40,25 +40,25 @@ if TYPE_CHECKING:
     from dbthermal.separation._subspace.method import SubspaceSettings
 
 _UNEXPLAINED: Final = (
-    "In {:.0%} of the image parts with moving reflections the bands do not show the same at the same "
-    "time, and no shift of the reflections explains it. If an object is heated in steps, or rows "
-    "or columns have noise in common, the intervals hold; if the cameras stand apart and a pixel "
+    "In {:.0%} of the image parts with moving reflections the bands do not show the same at the "
+    "same time, and no shift of the reflections explains it. If an object is heated in steps, or "
+    "rows or columns share noise, the intervals hold; if the cameras stand apart and a pixel "
     "mirrors several depths, or their clocks differ, those of pixels without a flag are too small."
 )
 _ROUNDS: Final = 3  # in which motion is undone
-_KEPT: Final = 0.9  # share of the pixels without a flag that a mended capture must keep
+_RETENTION: Final = 0.9  # share of the pixels without a flag that a mended capture must keep
 _NOT_COMPLETED: Final = (
     "Pixels that cannot be measured stay NaN: no library has emissivities of the bands {}. To be "
     f"completed, the bands must have names of {[*FILTERS]} when the capture is made, or a prior on "
     "their emissivities."
 )
-_MANY: Final = 0.3  # share of asynchronous pixels from which a shift does not explain them
+_SHIFT_SHARE: Final = 0.3  # share of asynchronous pixels from which a shift does not explain them
 # Share of asynchronous pixels from which the clocks are compared: of scenes with one clock at most
 # 0.003, beside reflections at several depths; and the part of it that one clock may leave.
-_SOME, _LESS = 0.05, 0.5
+_CLOCK_SHARE, _REDUCTION = 0.05, 0.5
 # Delay beside a shift from which clocks are compared [frame], and in deviations: of cameras of one
 # clock 0.012 at most, of clocks half a frame or more apart 0.4 to 0.9.
-_LATE, _SIGMAS = 0.05, 3.0
+_DELAY, _SIGMAS = 0.05, 3.0
 # Rounds in which scales of a reflection of a colour are found, and their change that moves no
 # object: 0.05 % of 20 K are 0.01 K.
 _SCALINGS, _SETTLED = 5, 5e-4
@@ -150,7 +150,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
         level = None if surroundings is None else float(np.mean(surroundings))
         colour = colour_of(background_ratio, names, inputs.bands[0], level, surroundings_std)
     response = inputs.response  # with one noise for all steps
-    unlike = against_response(corrected, response) + of_one_camera(corrected, response)
+    notes = against_response(corrected, response) + of_one_camera(corrected, response)
 
     # Lay the images on one another.
     laid = overlay(corrected, inputs)
@@ -190,7 +190,7 @@ def separate(  # noqa: PLR0913 - all but the first two by name
         result["material"] = materials
     source = "none" if measured.reflection_shift is None else "found"
     source = source if reflection_shift is None else "given"
-    return warned(result.assign_attrs(reflection_shift=source), *unlike, *doubts)
+    return warned(result.assign_attrs(reflection_shift=source), *notes, *doubts)
 
 
 def _on_one_clock(
@@ -200,7 +200,7 @@ def _on_one_clock(
     outcome = trial(capture)
     unchanged = capture, outcome, list[str]()
     names, share = capture["band"].values.tolist(), outcome[0].asynchronous
-    if share <= _SOME and not outcome[0].late:
+    if share <= _CLOCK_SHARE and not outcome[0].late:
         return unchanged
     try:
         with catch_warnings(record=True) as notes:  # said only if its clocks are taken
@@ -209,15 +209,15 @@ def _on_one_clock(
         return unchanged
     # Nor does one clock show what a delay too short to matter would explain.
     offsets, std = np.array(aligned.attrs["time_offset"]), aligned.attrs.get("time_offset_std")
-    if np.abs(offsets).max() < _LATE * np.median(np.diff(capture["time"].values)):
+    if np.abs(offsets).max() < _DELAY * np.median(np.diff(capture["time"].values)):
         return unchanged
     aligned = aligned.assign_coords(time=capture["time"])
     # Not if a band lacks more samples than can be bridged: at steps none is interpolated.
     lost = ~schema.measured(_samples.some_pixels(aligned["counts"]))
     retry = outcome if lost.mean(axis=(1, 2)).max() > MOST_BRIDGED else trial(aligned)
     # Nor if it leaves a delay, or a displacement that no shift explains.
-    less = retry[0].asynchronous <= max(_LESS * share, _SOME) and not retry[0].late
-    if not less or len(retry[0].doubts) > len(outcome[0].doubts):
+    gain = retry[0].asynchronous <= max(_REDUCTION * share, _CLOCK_SHARE) and not retry[0].late
+    if not gain or len(retry[0].doubts) > len(outcome[0].doubts):
         return unchanged
     place = int(np.abs(offsets).argmax())
     certainty = "" if std is None else f", known to {std:.4f} s"
@@ -240,7 +240,7 @@ def _mended(
         # Of six worlds that move at most 0.003 of the misfit stays; before a lamp, at rest, 2.1.
         if not repeat[1].size < misfit.size:
             break
-        undone = repeat[0].sound >= _KEPT * measured.sound
+        undone = repeat[0].sound >= _RETENTION * measured.sound
         sentences = [steady.sentence(undone=undone)]
         if not undone:
             break
@@ -248,16 +248,16 @@ def _mended(
         remainder = np.hypot(remainder, steady.detail(measured.inputs, measured.result))
     misfit = replace(misfit, change=np.hypot(misfit.change, remainder))
     outcome = measured, misfit
-    alike = equalise(capture, measured.inputs, measured.result, misfit)
+    repair = equalise(capture, measured.inputs, measured.result, misfit)
     # A blur leaves the shift as it is, but less of the texture that tells it.
-    retry = None if alike is None else trial(alike.capture, measured.reflection_shift)
-    if alike and retry and retry[0].sound > _KEPT * measured.sound:
-        measured, less = retry
+    retry = None if repair is None else trial(repair.capture, measured.reflection_shift)
+    if repair and retry and retry[0].sound > _RETENTION * measured.sound:
+        measured, residual = retry
         # Noise that is not white is estimated before the blur, which lessens rapid noise alone.
-        detail = np.hypot(remainder, alike.detail)
-        less = replace(less, change=np.hypot(less.change, detail), single=misfit.single)
-        capture, outcome = alike.capture, (measured, less)
-        sentences.append(alike.sentence)
+        detail = np.hypot(remainder, repair.detail)
+        residual = replace(residual, change=np.hypot(residual.change, detail), single=misfit.single)
+        capture, outcome = repair.capture, (measured, residual)
+        sentences.append(repair.sentence)
     return capture, outcome, late + sentences
 
 
@@ -282,15 +282,15 @@ class Measured:
         attrs = {} if self.reflection_shift is None else self.reflection_shift.attrs
         delay, std = (attrs.get(name, 0.0) for name in ("delay", "delay_std"))
         frame = np.median(np.diff(self.result["time"].values))
-        return bool(abs(delay) > max(_LATE * frame, _SIGMAS * std))
+        return bool(abs(delay) > max(_DELAY * frame, _SIGMAS * std))
 
     @property
     def asynchronous(self) -> float:
         """Share of the pixels with moving reflections whose bands do not show the same."""
         status = self.result["status"].values
         moving = (status & np.uint32(schema.UNMEASURED | Status.NO_BACKGROUND_MOTION)) == 0
-        apart = ((status & np.uint32(Status.BANDS_APART)) != 0) & moving
-        return float(apart.sum() / max(moving.sum(), 1))
+        flags = ((status & np.uint32(Status.BANDS_APART)) != 0) & moving
+        return float(flags.sum() / max(moving.sum(), 1))
 
 
 def _separated(
@@ -313,7 +313,7 @@ def _separated(
     per_pixel, surveys = separated(inputs, workers=workers, progress=progress)
     if reflection_shift is not None:
         share = Measured(per_pixel, inputs, None, reflection_shift, []).asynchronous
-    unexplained = share > (0.0 if reflection_shift is None else _MANY)
+    unexplained = share > (0.0 if reflection_shift is None else _SHIFT_SHARE)
     doubts = [_UNEXPLAINED.format(share)] if unexplained else []
     # Pool the pixels of each material, and hold them to what each tells by itself.
     result = per_pixel
@@ -343,9 +343,9 @@ def _as_gray(
     for _ in range(_SCALINGS):
         counts = empty(corrected["counts"].shape, np.float32)
         for band, curve in enumerate(inputs.curves):
-            rest, share = np.float32(curve.counts(level)), np.float32(scale[band])
+            base, share = np.float32(curve.counts(level)), np.float32(scale[band])
             for frame, image in zip(counts[band], corrected["counts"].values[band], strict=True):
-                frame[:] = rest + (image - rest) / share
+                frame[:] = base + (image - base) / share
             release()
         # Noise and pattern are divided as in most pixels.
         capture = corrected.assign(counts=corrected["counts"].copy(data=counts))
@@ -354,10 +354,10 @@ def _as_gray(
             before = corrected[name].values if name in corrected else 1.0
             capture[name] = "band", before / np.median(scale, axis=(1, 2))
         outcome = trial(capture)
-        used, scale = scale, colour.scale(outcome[0].result, scale)
-        if np.mean(np.abs(scale - used)) < _SETTLED:
+        divisor, scale = scale, colour.scale(outcome[0].result, scale)
+        if np.mean(np.abs(scale - divisor)) < _SETTLED:
             break
-    return capture, used, outcome
+    return capture, divisor, outcome
 
 
 def _restored(result: xr.Dataset, scale: Array, colour: Colour) -> xr.Dataset:

@@ -201,12 +201,12 @@ def separated(
     ):
 
         def separate_pixels(
-            inputs: Inputs, material: Material | None, wanted: Mask | None = None
+            inputs: Inputs, material: Material | None, selection: Mask | None = None
         ) -> Survey:
             """Separate all pixels into the result; or only survey those that are wanted."""
             survey = Survey.empty(len(inputs.bands), result["status"].size)
-            into = result if wanted is None else None
-            separate = partial(_separate, inputs, material, into, survey, wanted)
+            into = result if selection is None else None
+            separate = partial(_separate, inputs, material, into, survey, selection)
             for pixels in threads.map(separate, inputs.blocks):
                 bar.update(pixels)
             # Few pixels in pieces may be caused by a flaw, as a delay: they are searched anew.
@@ -226,7 +226,7 @@ def separated(
     if inputs.method.pools:
         _withhold(result)
     # Say what was used: noise, method, settings, warnings.
-    held = inputs.response.attrs | capture.attrs
+    metadata = inputs.response.attrs | capture.attrs
     notes = [np.atleast_1d(data.attrs.get("warnings", [])) for data in (inputs.response, capture)]
     doubts = dict.fromkeys(str(sentence) for note in notes for sentence in note)
     counts_per_kelvin = np.array([curve.reference_slope for curve in inputs.curves])
@@ -237,7 +237,7 @@ def separated(
         method=inputs.method.name,
         pooled=int(pooled),
         response_kind=inputs.response_kind,
-        **{key: held[key] for key in sorted(_ASSUMED & held.keys())},
+        **{key: metadata[key] for key in sorted(_ASSUMED & metadata.keys())},
         **({"warnings": [*doubts]} if doubts else {}),
         noise_source=inputs.response.attrs["noise_source"],
         emissivity_source="capture" if inputs.emissivity is None else "given",
@@ -292,12 +292,12 @@ def _separate(
     material: Material | None,
     result: xr.Dataset | None,
     survey: Survey,
-    wanted: Mask | None,
+    selection: Mask | None,
     rows: slice,
 ) -> int:
     """Separate a block of rows, or what is wanted of it, into its place; return its pixels."""
     size, options = 0, [] if inputs.settings is None else [inputs.settings]
-    for cut in tiles.cut(inputs, rows, material, wanted):
+    for cut in tiles.cut(inputs, rows, material, selection):
         estimates = []
         for frames, pixels, tile in cut.sections:
             estimate: Estimate = inputs.method.separate(tile, *options)
@@ -317,8 +317,8 @@ def _separate(
             for frames, pixels, estimate in estimates:
                 if estimate.division is not None and np.all(frames):
                     divided = estimate.division.any(axis=0)
-                    kept = np.packbits(estimate.division[:, divided], axis=0)
-                    inputs.division[:, cut.places[pixels][divided]] = kept
+                    bits = np.packbits(estimate.division[:, divided], axis=0)
+                    inputs.division[:, cut.places[pixels][divided]] = bits
         release()
         size += cut.status.size
     return size
@@ -330,19 +330,19 @@ def separated_dataset(
     """Stage `separated` of `schema` of some arrays, None for empty ones, on a capture's grid."""
     stage = {**schema.STAGES["separated"], **schema.OPTIONAL["separated"]}
     sizes = {**capture.sizes, "other_band": capture.sizes["band"]}
-    kept = {name: value for name, value in capture.attrs.items() if name in tiles.KEPT_ATTRS}
+    metadata = {name: value for name, value in capture.attrs.items() if name in tiles.KEPT_ATTRS}
     variables = {}
     for name, array in arrays.items():
         dims = stage[name].dims
         attrs = schema.Status.cf_attrs(schema.STATUS) if name == "status" else stage[name].attrs
         shape = tuple(sizes[dim] for dim in dims)
         values = empty(shape, stage[name].dtype) if array is None else array
-        variables[name] = (dims, values, {**attrs, **kept})
+        variables[name] = (dims, values, {**attrs, **metadata})
     names = ("band", "time", "y", "x")
     coordinates = {name: capture[name] for name in names if name in capture.coords}
     if _COVARIANCE in arrays:
         coordinates["other_band"] = capture["band"].rename(band="other_band")
-    return xr.Dataset(variables, coordinates, kept)
+    return xr.Dataset(variables, coordinates, metadata)
 
 
 @np.errstate(over="ignore")  # a deviation beyond single precision is infinite

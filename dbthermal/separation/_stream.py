@@ -28,13 +28,13 @@ from dbthermal.separation._tiles import Array, Whole
 if TYPE_CHECKING:
     from dbthermal.separation._subspace.method import SubspaceSettings
 
-_PARTS: Final = 5  # means over the latency
-_LOST: Final = 1.5  # intervals between frames, from which some are lost
+_MEANS: Final = 5  # means over the latency
+_GAP: Final = 1.5  # intervals between frames, from which some are lost
 _GLANCE: Final = 24  # pixels along the shorter side, by which a frame is told from another
 _RATES, _SECONDS = (1e-3, 1e5), (1e-5, 1e3)  # frame rates [Hz] and times [s] that are taken
 _ROWS: Final = 16  # that a thread takes at once
 _SAMPLES: Final = 128  # of the history at most; once reached, half of them at least
-_TOGETHER: Final = 4  # tiles of pixels that a thread separates at once
+_TILES: Final = 4  # tiles of pixels that a thread separates at once
 
 
 class Stream:
@@ -140,7 +140,7 @@ class Stream:
         self._resample = list[Any]()
         if inputs.displacement is not None:
             self._pair(inputs.displacement)
-        self._rate, self._block = frame_rate, max(1, round(frame_rate * latency / _PARTS))
+        self._rate, self._block = frame_rate, max(1, round(frame_rate * latency / _MEANS))
         self._half = half = max(1, int(frame_rate * latency / self._block) - 1)
         timing = self._block / frame_rate, memory, refresh
         inputs = replace(inputs, displacement=None)
@@ -222,9 +222,9 @@ class Stream:
         ValueError if none are known yet.
         """
         if not self.is_ready:
-            came, least = self._blocks * self._block, METHOD.minimum_frames * self._block
-            state = f"Missing frames: {came} came, and no temperatures are known"
-            raise ValueError(f"{state}. Must be at least {least}.")
+            count, minimum = self._blocks * self._block, METHOD.minimum_frames * self._block
+            state = f"Missing frames: {count} came, and no temperatures are known"
+            raise ValueError(f"{state}. Must be at least {minimum}.")
         return self._result
 
     def _checked(self, time: npt.ArrayLike, frames: Any, segment: int) -> tuple[Array, Planes]:
@@ -261,7 +261,7 @@ class Stream:
     def _take(self, now: float, frame: Planes) -> bool:
         """Take a frame (band, y, x) into the block that is being filled; true if it is full."""
         since = (now - self._now) * self._rate
-        if _LOST < since < np.inf:
+        if _GAP < since < np.inf:
             self.lost_frames += round(since) - 1
         if since > kernels.APART * self._block:
             self._filled = 0
@@ -391,10 +391,10 @@ class History:
             self._held = 1
             return
         self._held += 1
-        last = self.samples[:, self._times.shape[1] - 1]
+        sample = self.samples[:, self._times.shape[1] - 1]
         self._times[0, -1] += (time - self._times[0, -1]) / self._held
-        added = np.where(np.isnan(mean), 0.0, mean - last) / np.float32(self._held)
-        last[...] = np.where(np.isnan(last), mean, last + added)
+        added = np.where(np.isnan(mean), 0.0, mean - sample) / np.float32(self._held)
+        sample[...] = np.where(np.isnan(sample), mean, sample + added)
 
     def _make_room(self) -> None:
         """Forget the older half of the samples if the newer is long enough, else join pairs."""
@@ -430,7 +430,7 @@ class History:
                 {"time": self._times[0, :complete]},
             ),
         )
-        tasks = 1 + number * width // (_TOGETHER * tiles.PIXELS)
+        tasks = 1 + number * width // (_TILES * tiles.PIXELS)
         blocks = np.array_split(np.arange(self._next, stop), min(number, tasks))
         apply(lambda rows: self._separate(inputs, rows), [rows for rows in blocks if rows.size])
         self._next, self.solved = stop % height, True

@@ -23,7 +23,7 @@ Planes = npt.NDArray[np.float32]
 WINDOWS: Final = ((0.0, 0.0, 1), (0.5, 0.5, 1), (2.0, 1.0, 2), (4.0, 1.0, 2))
 APART: Final = 2.0  # lengths of a mean, from which two are not neighbours
 _NEWTON: Final = 3  # steps towards the object, at most
-_NEAR: Final = 1e-5  # length of the last step [K]
+_TOLERANCE: Final = 1e-5  # length of the last step [K]
 _ZERO, _ONE, _TWO = np.float32(0.0), np.float32(1.0), np.float32(2.0)
 _NAN, _SIGMAS, _LARGEST = np.float32(np.nan), np.float32(RANGE_SIGMAS), np.float32(LARGEST)
 _UNDEFINED: Final = int(
@@ -32,7 +32,7 @@ _UNDEFINED: Final = int(
     | Status.INVALID_SAMPLES
     | Status.NONPHYSICAL_EMISSIVITY
 )
-_BEYOND: Final = np.uint32(Status.OUTSIDE_RESPONSE)
+_RANGE_FLAG: Final = np.uint32(Status.OUTSIDE_RESPONSE)
 _AMBIGUOUS: Final = int(Status.CONSTANT_OBJECT | Status.ROLES_MAY_BE_SWAPPED)
 
 
@@ -178,7 +178,7 @@ def _object(
     place, scale = (start - table.middle) / table.half, 1.0 / table.half
     for _ in range(_NEWTON + 1):
         place, lack, slope = newton(mixed, target, place)
-        if abs(lack) < _NEAR * scale * abs(slope):
+        if abs(lack) < _TOLERANCE * scale * abs(slope):
             break
     u, du = kernels.with_slope(table.signal, place)
     v, dv = kernels.with_slope(second.signal, place)
@@ -302,4 +302,4 @@ def emit(
             for film in range(4):
                 block.films[film, f, y] = out[film]
         for x in range(block.films.shape[3]):
-            block.status[y, x] |= _BEYOND if out[4][x] > 0.0 else np.uint32(0)
+            block.status[y, x] |= _RANGE_FLAG if out[4][x] > 0.0 else np.uint32(0)

@@ -42,7 +42,7 @@ PIXELS: Final = 320
 _SAMPLES: Final = 2**19
 _COMPILED: Final = 8  # times as many pixels in a tile of a compiled method
 # Samples of a band that are resampled at once: few rows would mostly read those around them.
-_TOGETHER: Final = 2**23
+_BLOCK_SAMPLES: Final = 2**23
 _NOISE_STEP: Final = 0.05  # resampled samples whose noise differs by less are separated together
 RANGE_SIGMAS: Final = 5.0  # standard deviations beyond the calibrated range that are flagged
 USELESS: Final = 1e6  # temperature [K], emissivity [1] or deviation beyond which is no result
@@ -97,8 +97,8 @@ class Material(Pixels):
     @classmethod
     def of_ratios(cls, ratio: Array, inverse_energy: Array, spread: Array | float = 0.0) -> Self:
         """Materials without an emissivity."""
-        none, zeros = np.full(ratio.shape[1], np.nan), np.zeros(ratio.shape[1])
-        return cls(ratio, inverse_energy, none, none, none, zeros + spread)
+        blank, zeros = np.full(ratio.shape[1], np.nan), np.zeros(ratio.shape[1])
+        return cls(ratio, inverse_energy, blank, blank, blank, zeros + spread)
 
 
 @dataclass(frozen=True)
@@ -288,19 +288,19 @@ def cut(
     displacement, method = inputs.displacement, inputs.method
     sampled = _sampler(inputs, rows)
     width, frames = inputs.capture.sizes["x"], inputs.capture.sizes["time"]
-    most = largest(method, inputs.settings, inputs.capture)
-    size = most if displacement is None else max(width, _TOGETHER // frames)
+    limit = largest(method, inputs.settings, inputs.capture)
+    size = limit if displacement is None else max(width, _BLOCK_SAMPLES // frames)
     size = (rows.stop - rows.start) * width if method.whole_image else size
     for window in windows(rows, slice(0, width), size):
-        selected, patches = _patches(window, width, most if method.compiled else size, wanted)
+        selected, patches = _patches(window, width, limit if method.compiled else size, wanted)
         if not patches:
             continue
         # Read the pixels together; judge the samples, and group the pixels by valid frames.
         counts, usable, valid, status, gain = sampled(window, selected)
-        for patch, places, within, chosen in patches:
+        for patch, places, span, chosen in patches:
             # A tile's own samples lie together: rows of a large film are far apart in memory.
-            signals = np.ascontiguousarray(counts[..., within], dtype=np.float64)
-            bridged, flags = np.ascontiguousarray(usable[:, within]), status[within]
+            signals = np.ascontiguousarray(counts[..., span], dtype=np.float64)
+            bridged, flags = np.ascontiguousarray(usable[:, span]), status[span]
             if method.whole_image or method.every_frame:
                 sets = quality.common_frames(signals, bridged, flags, method.minimum_frames)
             else:
@@ -310,29 +310,29 @@ def cut(
             tile = replace(
                 tile_of(inputs, signals, patch, chosen),
                 surveyed=displacement is None or wanted is not None,
-                gain=gain[1, within] if displacement is not None and method.compiled else None,
+                gain=gain[1, span] if displacement is not None and method.compiled else None,
                 division=division if packed.any() else None,
                 material=None if material is None else material.select_pixels(places),
             )
             if inputs.difference is not None:
                 tile.signals[1:] -= inputs.difference(places)
             sections = list[Section]()
-            for used, pixels in sets:  # of which there may be many, each of few pixels
+            for mask, pixels in sets:  # of which there may be many, each of few pixels
                 whole = method.whole_image or np.all(pixels)
                 section = tile if whole else tile.select_pixels(pixels)
-                section = section if np.all(used) else section.select_frames(used)
+                section = section if np.all(mask) else section.select_frames(mask)
                 if displacement is None or method.compiled:
-                    sections.append((used, pixels, section))
+                    sections.append((mask, pixels, section))
                 else:
-                    sections.extend(of_one_noise(used, pixels, section, gain[1], most))
-            yield Cut(patch, places, flags, valid[:, within], sections)
+                    sections.extend(of_one_noise(mask, pixels, section, gain[1], limit))
+            yield Cut(patch, places, flags, valid[:, span], sections)
 
 
 def _patches(
-    window: Window, width: int, pixels: int, wanted: Mask | None
+    window: Window, width: int, pixels: int, selection: Mask | None
 ) -> tuple[slice | Whole, list[Patch]]:
     """Pixels of a window that are wanted, and patches of at most so many of them."""
-    if wanted is None:
+    if selection is None:
         patches, start = list[Patch](), 0
         for patch in windows(*window, pixels):
             places = _numbers(patch, width)
@@ -340,7 +340,7 @@ def _patches(
             start += places.size
         return slice(None), patches
     places = _numbers(window, width)
-    selected = np.flatnonzero(wanted[places])
+    selected = np.flatnonzero(selection[places])
     spans = [slice(start, start + pixels) for start in range(0, selected.size, pixels)]
     return selected, [(window, places[selected[span]], span, selected[span]) for span in spans]
 
@@ -431,13 +431,13 @@ def of_one_noise(
     """Yield parts of a tile, of at most so many pixels whose resampled bands have one noise."""
     order = np.rint(np.log(gain[pixels]) / _NOISE_STEP).astype(np.intp)
     for level in np.unique(order):
-        alike = np.flatnonzero(order == level)
-        for start in range(0, alike.size, most):
-            chosen = alike[start : start + most]
+        members = np.flatnonzero(order == level)
+        for start in range(0, members.size, most):
+            chosen = members[start : start + most]
             group = np.zeros_like(pixels)
             group[np.flatnonzero(pixels)[chosen]] = True
             factors = np.append(1.0, [np.exp(np.log(gain[group]).mean())] * (len(tile.noise) - 1))
             # A residual pattern is independent from pixel to pixel, and is scaled like the noise.
             noise, pattern = (tuple(factors * stds) for stds in (tile.noise, tile.pattern))
-            single = replace(tile.select_pixels(chosen), noise=noise, pattern=pattern)
-            yield frames, group, single
+            section = replace(tile.select_pixels(chosen), noise=noise, pattern=pattern)
+            yield frames, group, section

@@ -184,7 +184,7 @@ def test_a_short_capture_is_not_said_to_be_apart(seed: int) -> None:
     assert "warnings" not in separation.separate(shorter, rig.response()).attrs
 
 
-@pytest.mark.parametrize("seed", [7, 52])
+@pytest.mark.parametrize("seed", [44, 57])
 def test_a_smooth_object_is_not_said_to_lie_off(seed: int) -> None:
     """Noise that is alike in both bands by chance is no displacement of their images."""
     noise = (0.03, 0.1)

@@ -35,11 +35,11 @@ _OUTSIDE: Final = 0.2
 _LOST_WEIGHT: Final = 0.25  # weight of pixels without a value that good pixels may take over [1]
 # Share of the pixels of some rows up to which pixels are read singly: a shift that is as wide as
 # an image is high leaves most of them without a weight [1].
-_FEW: Final = 0.5
+_SHARE: Final = 0.5
 _ROWS: Final = 2**14  # rows of weights that are changed at once
 _NO_WEIGHT: Final = 1e-3  # weight below which a pixel's flags do not count [1]
 # Memory of resampled samples that are kept, for a capture is read some nine times [byte].
-_KEPT: Final = 2**29
+_CACHE: Final = 2**29
 # Weights by powers of the way between two samples (R. Keys 1981, doi:10.1109/TASSP.1981.1163711).
 _KEYS: Final = 0.5 * np.array([[0, -1, 2, -1], [2, 0, -5, 3], [0, 1, 4, -3], [0, 0, -1, 1]])
 
@@ -81,16 +81,16 @@ class Displacement:
         """Rows of the image that hold some rows, and the second camera's samples for these rows."""
         width = self.shape[1]
         first, last = self.resample.indptr[[rows.start * width, rows.stop * width]]
-        used = self.resample.indices[first:last] // width
-        if used.size == 0:
+        lines = self.resample.indices[first:last] // width
+        if lines.size == 0:
             return rows
-        return slice(min(rows.start, int(used.min())), max(rows.stop, int(used.max()) + 1))
+        return slice(min(rows.start, int(lines.min())), max(rows.stop, int(lines.max()) + 1))
 
     def weights(self, rows: slice, source: slice) -> csr_array:
         """Weights of the source's pixels at the pixels of some rows."""
         width = self.shape[1]
-        pixels, around = (slice(span.start * width, span.stop * width) for span in (rows, source))
-        return csr_array(self.resample[pixels, around])
+        pixels, sources = (slice(span.start * width, span.stop * width) for span in (rows, source))
+        return csr_array(self.resample[pixels, sources])
 
 
 def check(field: xr.Dataset, corrected: xr.Dataset, reference: int) -> Displacement:
@@ -133,8 +133,8 @@ def check(field: xr.Dataset, corrected: xr.Dataset, reference: int) -> Displacem
 
 def _check_bands(field: xr.Dataset, names: list[str], reference: str) -> None:
     """Check the bands that the field says it is of, where it does."""
-    second = [name for name in names if name != reference]
-    for key, rule in (("reference_band", [reference]), ("bands", second)):
+    bands = [name for name in names if name != reference]
+    for key, rule in (("reference_band", [reference]), ("bands", bands)):
         stated = [str(name) for name in np.atleast_1d(field.attrs.get(key, rule))]
         if sorted(stated) != sorted(rule):
             raise ValueError(
@@ -155,15 +155,15 @@ def _inverse(shift: Array, pixels: Array) -> tuple[Array, Mask]:
     return place, step < _UNSOLVED
 
 
-def _interpolation(place: Array, used: Mask) -> csr_array:
+def _interpolation(place: Array, mask: Mask) -> csr_array:
     """Weights (pixel, pixel) of an image at its places (2, y, x) [pixel] that are used; else 0."""
-    (height, width), (last, end) = used.shape, np.array(used.shape) - 1 + _OUTSIDE
-    used = used & np.all(place >= -_OUTSIDE, axis=0) & (place[0] <= last) & (place[1] <= end)
-    (row, down), (column, right) = _keys(place[0][used], height), _keys(place[1][used], width)
+    (height, width), (last, end) = mask.shape, np.array(mask.shape) - 1 + _OUTSIDE
+    mask = mask & np.all(place >= -_OUTSIDE, axis=0) & (place[0] <= last) & (place[1] <= end)
+    (row, down), (column, right) = _keys(place[0][mask], height), _keys(place[1][mask], width)
     index = (row[:, np.newaxis] * width + column).reshape(16, -1).T
     weight = (down[:, np.newaxis] * right).reshape(16, -1).T
-    start = np.concatenate([[0], np.cumsum(16 * used.ravel())])
-    result = csr_array((weight.ravel(), index.ravel(), start), shape=(used.size, used.size))
+    start = np.concatenate([[0], np.cumsum(16 * mask.ravel())])
+    result = csr_array((weight.ravel(), index.ravel(), start), shape=(mask.size, mask.size))
     result.sum_duplicates()
     result.eliminate_zeros()
     return result
@@ -175,9 +175,9 @@ def _keys(place: Array, size: int) -> tuple[npt.NDArray[np.intp], Array]:
     powers = (place - first) ** np.arange(4)[:, np.newaxis]
     index, weight = first.astype(np.intp) + np.arange(-1, 3)[:, np.newaxis], _KEYS @ powers
     # Beyond an end a parabola through three samples goes on, of which a slope of them is no error.
-    for outer, others in ((0, [1, 2, 3]), (3, [2, 1, 0])) if size > 2 else ():
+    for outer, inner in ((0, [1, 2, 3]), (3, [2, 1, 0])) if size > 2 else ():
         outside = (index[outer] < 0) | (index[outer] >= size)
-        weight[others] += np.outer([3.0, -3.0, 1.0], weight[outer] * outside)
+        weight[inner] += np.outer([3.0, -3.0, 1.0], weight[outer] * outside)
         weight[outer, outside] = 0.0
     return np.clip(index, 0, size - 1), weight
 
@@ -193,15 +193,15 @@ def paired(
 ) -> Paired:
     """Read some pixels of some rows as `read` does, their short gaps bridged."""
     # Samples of the second camera are kept, in single precision: they are not resampled again.
-    kept, place, bands = displacement.kept, (rows.start, rows.stop), capture.sizes["band"]
-    if (resampled := kept.get(place)) is None:
+    cache, place, bands = displacement.kept, (rows.start, rows.stop), capture.sizes["band"]
+    if (resampled := cache.get(place)) is None:
         block, grains = load()
         counts, valid, status, gain = read(block, displacement, rows, source, fewest, grains)
         packed = None if valid.all() else np.packbits(valid, axis=0)
         second = counts[displacement.others].astype(np.float32)
         resampled = Resampled(second, packed, status, gain)
-        if sum(film.counts.nbytes for film in (resampled, *kept.values())) <= _KEPT:
-            kept[place] = resampled
+        if sum(film.counts.nbytes for film in (resampled, *cache.values())) <= _CACHE:
+            cache[place] = resampled
     # Gaps are bridged in frames that most pixels of the rows have: then all pixels are read.
     pixels = selected if resampled.packed is None else slice(None)
     first = capture["counts"].isel(band=displacement.reference, y=rows).values
@@ -234,16 +234,16 @@ def read(
     inner = slice(rows.start - source.start, rows.stop - source.start)
     first = block.isel(band=[reference], y=inner)
     weights = displacement.weights(rows, needed)
-    used, place = _used(weights, slice(needed.start - source.start, needed.stop - source.start))
+    pixels, place = _used(weights, slice(needed.start - source.start, needed.stop - source.start))
     counts, valid, status = quality.read(first, fewest, [grains[reference]])
     second = block.isel(band=second_bands, **place)
-    seen, measured, flags = quality.read(second, fewest, [grains[band] for band in second_bands])
-    seen, usable = quality.bridge(seen, measured, block["time"].values.astype(np.float64))
+    signals, measured, flags = quality.read(second, fewest, [grains[band] for band in second_bands])
+    signals, usable = quality.bridge(signals, measured, block["time"].values.astype(np.float64))
     bad = np.zeros(weights.shape[1], dtype=bool)
-    bad[used] = quality.unusable(flags)
-    weights = without(weights, bad, displacement.shape[1])[:, used]
+    bad[pixels] = quality.unusable(flags)
+    weights = without(weights, bad, displacement.shape[1])[:, pixels]
     counts = np.stack([counts[0]] * (len(second_bands) + 1))
-    for band, signal in zip(second_bands, seen, strict=True):
+    for band, signal in zip(second_bands, signals, strict=True):
         counts[band] = (weights @ signal.T).T
     share = abs(weights)
     if not measured.all():  # a sample that was bridged does not count where its weight is small
@@ -267,18 +267,18 @@ def read(
         # Neighbours that a registration has interpolated share noise: measured, not computed.
         key, films = (rows.start, rows.stop, source.start, source.stop), counts[second_bands]
         measure = partial(samples.resampled_noise, stated=gain, width=displacement.shape[1])
-        gain *= displacement.once(key, lambda: measure(seen[:, :, good], films))
+        gain *= displacement.once(key, lambda: measure(signals[:, :, good], films))
     return counts, valid, status, np.stack([np.ones_like(gain), gain])
 
 
 def _used(weights: csr_array, rows: slice) -> tuple[Any, dict[str, Any]]:
     """Pixels of some rows that have a weight, if few; and the places of the pixels to read."""
-    used, pixels = np.unique(weights.indices), weights.shape[1]
-    if used.size > _FEW * pixels:
+    columns, pixels = np.unique(weights.indices), weights.shape[1]
+    if columns.size > _SHARE * pixels:
         return slice(None), {"y": rows}
-    y, x = np.divmod(used, pixels // (rows.stop - rows.start))
+    y, x = np.divmod(columns, pixels // (rows.stop - rows.start))
     places = {"y": y + rows.start, "x": x}
-    return used, {name: xr.DataArray(index, dims="pixel") for name, index in places.items()}
+    return columns, {name: xr.DataArray(index, dims="pixel") for name, index in places.items()}
 
 
 def without(weights: csr_array, bad: Mask, width: int) -> csr_array:
@@ -293,16 +293,16 @@ def without(weights: csr_array, bad: Mask, width: int) -> csr_array:
         # The entries of these rows, side by side.
         start, count = weights.indptr[group, np.newaxis], np.diff(weights.indptr)[group, np.newaxis]
         place = np.arange(count.max())
-        held = place < count
-        entries = start + np.where(held, place, 0)
-        pixels, values = weights.indices[entries], weights.data[entries] * held
+        mask = place < count
+        entries = start + np.where(mask, place, 0)
+        pixels, values = weights.indices[entries], weights.data[entries] * mask
         off = bad[pixels]
         # A plane about their middle.
         plane, size = np.stack([np.ones(pixels.shape), *np.divmod(pixels, width)]), np.abs(values)
         plane[1:] -= ((plane[1:] * size).sum(axis=-1) / size.sum(axis=-1))[..., np.newaxis]
         # The smallest change of the good pixels' weights with the same sums over the plane.
-        good, missing = plane * (held & ~off), (plane * (values * off)).sum(axis=-1)
+        good, missing = plane * (mask & ~off), (plane * (values * off)).sum(axis=-1)
         change = np.linalg.pinv(np.moveaxis(good, 0, 1)) @ missing.T[..., np.newaxis]
         values = np.where(off, 0.0, values + change[..., 0])
-        weights.data[entries[held]] = values[held]
+        weights.data[entries[mask]] = values[mask]
     return weights

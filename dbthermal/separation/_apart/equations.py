@@ -27,7 +27,7 @@ from dbthermal.separation._tiles import Mask, Material, Whole
 
 Floats = npt.NDArray[np.floating[Any]]
 
-_LARGEST: Final = 0.95  # share of an error that a step may leave
+_CONTRACTION: Final = 0.95  # share of an error that a step may leave
 _MARGIN: Final = 0.02  # of an emissivity to the ends of what the ratios leave [1]
 # Degree of the bend between two responses: over 165 K its slope is 0.014 % off, 0.25 % of 4.
 _DEGREE: Final = 8
@@ -129,9 +129,9 @@ def inside(emissivity: Floats) -> Floats:
     """Emissivities of the same ratios, all of them well inside (0, 1)."""
     ratio = ratio_of(emissivity)
     # e_m > 0 leaves 0 < 1 - e_1 < 1 / kappa.
-    most = 1.0 / np.maximum(ratio.max(axis=0), 1.0)
-    place = np.clip((1.0 - emissivity[0]) / most, _MARGIN, 1.0 - _MARGIN)
-    return np.asarray(1.0 - ratio * most * place)
+    limit = 1.0 / np.maximum(ratio.max(axis=0), 1.0)
+    place = np.clip((1.0 - emissivity[0]) / limit, _MARGIN, 1.0 - _MARGIN)
+    return np.asarray(1.0 - ratio * limit * place)
 
 
 def weights(inputs: Inputs, emissivity: Floats) -> Floats:
@@ -167,8 +167,8 @@ def equations(inputs: Inputs, emissivity: Floats, solved: Mask) -> Equations:
     strong = np.abs(second) < size
     # The error of a step: only where it contracts, with the weights' signs, are places linked.
     forward, back = abs(at_p).sum(axis=1) * np.abs(second), abs(onward) @ size
-    reached &= back < _LARGEST * np.abs(onward @ second)
-    linked &= np.where(strong, forward < _LARGEST * size, reached)
+    reached &= back < _CONTRACTION * np.abs(onward @ second)
+    linked &= np.where(strong, forward < _CONTRACTION * size, reached)
     backward = np.flatnonzero(linked & ~strong)
     return Equations(
         first=np.where(solved, emissivity[0], 1.0),
@@ -237,14 +237,14 @@ def samples(inputs: Inputs, frames: Whole) -> tuple[Floats, Floats]:
     """Signal (frame, pixel) [K] of the reference band, and the steps of the camera in it."""
     functions, width = smooth_functions(inputs.capture), inputs.capture.sizes["x"]
     # A sample that is no measurement is 0, an outlier of the regression.
-    first = np.nan_to_num(_signal(inputs, time=frames)).reshape(frames.size, -1)
-    steps = np.zeros_like(first)
+    signal = np.nan_to_num(_signal(inputs, time=frames)).reshape(frames.size, -1)
+    steps = np.zeros_like(signal)
     if functions.steps:
         of_camera = functions.functions - functions.object_part
         for rows in inputs.blocks:
             pixels = np.arange(rows.start * width, rows.stop * width)
             steps[:, pixels] = of_camera[frames] @ (functions.functions.T @ _film(inputs, pixels))
-    return first, steps
+    return signal, steps
 
 
 def change(inputs: Inputs, loose: Whole, result: xr.Dataset, threads: Executor) -> Change:
@@ -255,21 +255,21 @@ def change(inputs: Inputs, loose: Whole, result: xr.Dataset, threads: Executor) 
     bad = displacement.once("bad", lambda: _bad(inputs, threads))
     at_p = without(displacement.resample[loose], bad, displacement.shape[1])
     unknown = abs(at_p) @ bad > 0.0
-    across = displacement.onward[loose]  # at r + d(r), nearly as far from r as p
+    onward = displacement.onward[loose]  # at r + d(r), nearly as far from r as p
     names, second = ("reflection_ratio", "reflection_ratio_std"), inputs.bands[1]
     ratio, std = (result[name].values[second].ravel() for name in names)
     nearest = abs(at_p).argmax(axis=1)
     variance = (std[nearest] ** 2 + std[loose] ** 2) * chdtri(1, reflection_ratio.CHANCE)
     # Where p has another ratio than r it may be of another material, with another signal: the
     # deviation then holds the difference to the change from the other side of r.
-    unlike = ~unknown & ((ratio[nearest] - ratio[loose]) ** 2 > variance)
-    unlike &= (abs(across) @ bad == 0.0) & (across.sum(axis=1) > 0.0)
+    borders = ~unknown & ((ratio[nearest] - ratio[loose]) ** 2 > variance)
+    borders &= (abs(onward) @ bad == 0.0) & (onward.sum(axis=1) > 0.0)
     # Only the pixels that they are made of are read.
-    pixels = np.unique(np.concatenate([loose, at_p.indices, across.indices]))
+    pixels = np.unique(np.concatenate([loose, at_p.indices, onward.indices]))
     film = _film(inputs, pixels).T
     at_r = film[np.searchsorted(pixels, loose)]
     moved = at_p[:, pixels] @ film - at_r
-    bend = moved + across[:, pixels] @ film - at_r
+    bend = moved + onward[:, pixels] @ film - at_r
     moved[unknown] = 0.0
     # Smoothed, it is the change of e_1 u_1(x) and holds little of the reflection's change.
     curves = moved @ functions.functions
@@ -285,8 +285,8 @@ def change(inputs: Inputs, loose: Whole, result: xr.Dataset, threads: Executor) 
     lagged = np.nan_to_num(np.clip(lagged / energy, 0.0, 0.98))
     correlated = energy * columns / frames**2 * (1.0 + lagged) / (1.0 - lagged)
     variance = np.where(divided, correlated, variance)
-    bend = bend[unlike] @ functions.functions @ functions.object_part.T
-    variance[unlike] += np.mean(bend**2, axis=1)
+    bend = bend[borders] @ functions.functions @ functions.object_part.T
+    variance[borders] += np.mean(bend**2, axis=1)
     # One that is not known, beside bad pixels, may be as large as any other.
     largest = film if unknown.all() else curves @ functions.object_part.T
     variance[unknown] = np.max(largest**2, initial=0.0)
@@ -381,10 +381,10 @@ def _backward(
     starts, columns, values = terms.onward
     film[:] = 0.0
     for entry in range(starts[place], starts[place + 1]):
-        weight, beyond = values[entry], columns[entry]
-        first = terms.shares[0, beyond]
+        weight, source = values[entry], columns[entry]
+        first = terms.shares[0, source]
         for t in range(film.size):
-            film[t] += weight * (target[beyond, t] - first * signal[beyond, t])
+            film[t] += weight * (target[source, t] - first * signal[source, t])
     _other_bands(terms.beyond, place, terms.bends, signal[pixel], spare)
     slope = terms.beyond[:, place].sum()
     for t in range(film.size):

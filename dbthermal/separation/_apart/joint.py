@@ -77,7 +77,7 @@ class Frames:
     def of(cls, result: xr.Dataset) -> "Frames":
         """Frames at which a result's object is solved: few if it changes smoothly, else all."""
         film, std = (result[name].values.reshape(result.sizes["time"], -1) for name in _OBJECT)
-        time, every = result["time"].values, np.arange(len(film))
+        time, frames = result["time"].values, np.arange(len(film))
         functions = smooth.largest(time).functions
         count = _NODES * functions.shape[1]
         # Polynomials through nodes close together near the ends (Chebyshev) repeat a smooth film.
@@ -88,7 +88,7 @@ class Frames:
         # Off by more than a share of the deviation, in more than a few samples: a rapid object.
         off = np.abs(weights[sampled] @ film[nodes] - film[sampled]) / std[sampled]
         if nodes.size == time.size or not _most(off) < _NO_MATTER:
-            return cls(every, None)
+            return cls(frames, None)
         return cls(nodes, weights)
 
 
@@ -143,25 +143,25 @@ class Joint:
         curves = curves.reshape(-1, *status.shape)
         # Beside a pixel without a background it is taken to go on.
         lost = np.isnan(curves[0])
-        near = distance_transform_edt(lost, return_distances=False, return_indices=True)
-        curves = np.nan_to_num(curves[:, near[0], near[1]])
+        place = distance_transform_edt(lost, return_distances=False, return_indices=True)
+        curves = np.nan_to_num(curves[:, place[0], place[1]])
         # A reflection resampled off by dd: dq = sum_m w_m (1 - e_m) grad(y) . dd, smoothed in time.
         weights = system.weights(self.inputs, self.emissivity)
-        off = ((1.0 - self.emissivity) * weights)[1:].sum(0) * displacement.std
-        off = np.nan_to_num(off).reshape(2, *status.shape)
+        error = ((1.0 - self.emissivity) * weights)[1:].sum(0) * displacement.std
+        error = np.nan_to_num(error).reshape(2, *status.shape)
         slopes = [
             gaussian_filter1d(curves, 1.0, axis=axis, order=1) * component.astype(np.float32)
-            for axis, component in zip((1, 2), off, strict=True)
+            for axis, component in zip((1, 2), error, strict=True)
         ]
         # Without a solution x(p) was taken for x(r): they differ as at the nearest solution, and
         # farther off by as much more as the difference changes where it is solved.
         unsolved = np.isnan(self.signals[0]).all(axis=0).reshape(status.shape)
-        distance, near = distance_transform_edt(unsolved, return_indices=True)
+        distance, place = distance_transform_edt(unsolved, return_indices=True)
         films = self.signals[:, looked_at(self.signals.shape[1])].reshape(2, -1, *status.shape)
         difference = films[1] - films[0]
         steps = [np.diff(difference, axis=axis) ** 2 for axis in (1, 2)]
         growth = sum(np.nansum(step) / max(np.isfinite(step).sum(), 1) for step in steps)
-        square = (difference**2).mean(axis=0)[near[0], near[1]] + growth * distance**2
+        square = (difference**2).mean(axis=0)[place[0], place[1]] + growth * distance**2
         share = (weights * self.emissivity)[1:].sum(0).reshape(status.shape)
         square = np.nan_to_num(unsolved * share**2 * square)
         factor = self.factor(threads).reshape(status.shape)
@@ -280,16 +280,16 @@ def _objects_at(
     packed, films = equations.packed, np.empty((2, frames.size, equations.solved.size), np.float32)
 
     @np.errstate(invalid="ignore", divide="ignore", over="ignore")  # of the thread
-    def solve_some(few: slice) -> Floats:
-        combination, guess = target(frames[few])
+    def solve_some(span: slice) -> Floats:
+        combination, guess = target(frames[span])
         if start is not None:
-            guess = np.where(np.isfinite(start[few].T), start[few].T, guess)
-        at_r, at_p, step = packed.solve(combination, guess, change.at(frames[few]))
-        films[0, few], films[1, few] = at_r.T, at_p.T
+            guess = np.where(np.isfinite(start[span].T), start[span].T, guess)
+        at_r, at_p, step = packed.solve(combination, guess, change.at(frames[span]))
+        films[0, span], films[1, span] = at_r.T, at_p.T
         return step
 
-    few = [slice(first, first + _FRAMES) for first in range(0, frames.size, _FRAMES)]
-    return films, np.fmax.reduce([*threads.map(solve_some, few)])
+    spans = [slice(first, first + _FRAMES) for first in range(0, frames.size, _FRAMES)]
+    return films, np.fmax.reduce([*threads.map(solve_some, spans)])
 
 
 def _by_maps(
@@ -370,10 +370,10 @@ def _emissivities(
     emissivity, noise = system.inside(raw), inputs.noise[inputs.bands[0]]
     measured = np.isfinite(result["emissivity"].values[inputs.bands[0]].ravel())
     solved, step = equations.spread(np.ones(films.shape[2], dtype=bool)), np.zeros(len(raw[0]))
-    few = [slice(first, first + _PIXELS) for first in range(0, films.shape[2], _PIXELS)]
+    spans = [slice(first, first + _PIXELS) for first in range(0, films.shape[2], _PIXELS)]
     for _ in range(_ROUNDS):
         emit = partial(_emission, films, band, emissivity[0, solved], noise)
-        estimates = map(np.concatenate, zip(*threads.map(emit, few), strict=True))
+        estimates = map(np.concatenate, zip(*threads.map(emit, spans), strict=True))
         slope, variance, sound = (equations.spread(values) for values in estimates)
         likely = 1.0 - system.ratio_of(raw) * (1.0 - slope)
         sound &= measured & np.all((likely > 0.0) & (likely < 1.0), axis=0)
@@ -396,20 +396,20 @@ def _emissivities(
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def _emission(
-    films: Floats, band: list[Floats], emissivity: Floats, noise: float, few: slice
+    films: Floats, band: list[Floats], emissivity: Floats, noise: float, span: slice
 ) -> tuple[Floats, Floats, Mask]:
     """Emissivity of the first band as its slope over the object, its variance, and its validity."""
     # Object at both places (2, frame, solved) [K]; band: signal, steps of the camera in it [K].
-    signal, at_p = films[..., few].astype(np.float64)
-    slope, variance, energy, kernel = regression.lines(signal, band[0][:, few], noise)
+    signal, at_p = films[..., span].astype(np.float64)
+    slope, variance, energy, kernel = regression.lines(signal, band[0][:, span], noise)
     # A gradient as steep as the object's own change turns the step round: divide by it.
     centred = signal - signal.mean(axis=0)
     steep = (centred * at_p).sum(axis=0) / (centred**2).sum(axis=0)
     steep = np.where(np.isfinite(steep) & (steep > 1.0), steep, 1.0)
     # Its variance: of the noise, and what the steps of the camera are as a slope.
-    variance = (variance + (kernel * band[1][:, few]).sum(axis=0) ** 2) / steep**2
+    variance = (variance + (kernel * band[1][:, span]).sum(axis=0) ** 2) / steep**2
     sound = energy > _LEAST_CHANGE**2 * len(signal)
-    return emissivity[few] + (slope - emissivity[few]) / steep, variance, sound
+    return emissivity[span] + (slope - emissivity[span]) / steep, variance, sound
 
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
@@ -446,12 +446,12 @@ def _factor(
     linear = replace(equations, bends=np.zeros_like(equations.bends)).packed
     places = equations.solved
 
-    def power_of(few: slice) -> Floats:
-        signal, _, _ = linear.solve(target[places, few], errors[places, few], change[:, few])
+    def power_of(span: slice) -> Floats:
+        signal, _, _ = linear.solve(target[places, span], errors[places, span], change[:, span])
         return np.asarray(np.square(signal, dtype=np.float64).sum(axis=1) / _DRAWS)
 
-    few = [slice(start, start + _FRAMES) for start in range(0, _DRAWS, _FRAMES)]
-    sized, power = size[:, 0] > 0, equations.spread(np.sum([*threads.map(power_of, few)], axis=0))
+    spans = [slice(start, start + _FRAMES) for start in range(0, _DRAWS, _FRAMES)]
+    sized, power = size[:, 0] > 0, equations.spread(np.sum([*threads.map(power_of, spans)], axis=0))
     settled = power < _GROWN * size[:, 0] ** 2  # elsewhere the iteration grows
     # Over a few pixels: neighbours have nearly the same, and the draws are few.
     powers = np.where(settled, [power, size[:, 0] ** 2], 0.0).reshape(2, *displacement.shape)

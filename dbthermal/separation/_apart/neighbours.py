@@ -43,16 +43,16 @@ BLURS: Final = (0.0, BLUR, 2.0 * BLUR)
 """Deviations of the blurs of a material, rising [pixel]."""
 
 # Deviation of the neighbourhood in which ratios are compared: that of a field and its data [pixel].
-_WIDE: Final = 6.0
+_SPAN: Final = 6.0
 # Windows along the image's smaller side, and how many of a material have a jackknife.
 _ALONG, _FEWEST = 4, 3
 # Chance that a blur changes the ratio of a pixel inside a material so much [1], and how many pixels
 # lie so side by side at a border: at 6e-5 half of those there were missed, 0.1 to 0.5 K off.
-_MIXED, _TOGETHER = 0.01, 3
+_MIXED, _CLUSTER = 0.01, 3
 # Share of a neighbourhood that tells the ratio of a pixel which does not, at least [1].
 _SOME: Final = 0.1
 # Deviation of the neighbourhood that tells an emissivity, over the image's smaller side.
-_AROUND: Final = 0.125
+_NEIGHBOURHOOD: Final = 0.125
 
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
@@ -68,7 +68,7 @@ def ratios(inputs: Inputs, planes: Planes, status: Bits) -> Material:
     change = ((border - ratio) ** 2 / of_border)[1:].mean(axis=0)
     usual = np.maximum(_median(change, np.isfinite(change) * 1.0) / chdtri(1, 0.5), 1.0)
     mixed = moving & (change > usual * chdtri(1, _MIXED)) & ~sharp.apart.reshape(status.shape)
-    mixed &= convolve(mixed * 1, np.ones((3, 3)), mode="constant") >= _TOGETHER
+    mixed &= convolve(mixed * 1, np.ones((3, 3)), mode="constant") >= _CLUSTER
     sound = moving & ~mixed & ~blurred.apart.reshape(status.shape)
     sound &= np.all(np.isfinite(variance), axis=0)
     if inputs.difference is not None:  # else flags of the object say nothing
@@ -78,11 +78,11 @@ def ratios(inputs: Inputs, planes: Planes, status: Bits) -> Material:
     weight[0] = sound
     middle = np.stack([_median(*band) for band in zip(ratio, weight, strict=True)])
     square = (ratio - middle) ** 2
-    chi = neighbour_mean((square * weight)[1:].mean(axis=0), sound, _WIDE)
-    between = neighbour_mean(square, weight, _WIDE)
+    chi = neighbour_mean((square * weight)[1:].mean(axis=0), sound, _SPAN)
+    between = neighbour_mean(square, weight, _SPAN)
     # At a border, where a blur mixes two materials, the sharp bands' ratio; where the model does
     # not hold, the median around, with the variance of the ratios around beside it.
-    cases = [mixed, sound, moving & (gaussian_filter(sound * 1.0, _WIDE, mode="constant") > _SOME)]
+    cases = [mixed, sound, moving & (gaussian_filter(sound * 1.0, _SPAN, mode="constant") > _SOME)]
     ratio = np.select(cases, [border, ratio, middle], np.nan)
     variance = np.select(cases, [of_border * usual, variance * np.maximum(chi, 1.0), between])
     ratio, variance = (values.reshape(len(noise), -1) for values in (ratio, variance))
@@ -157,36 +157,36 @@ def _between_windows(image: Image, survey: Survey, noise: Array, shape: tuple[in
     result = np.full(int(image.labels.max()) + 1, np.nan)
     for label in np.unique(labels):
         pixels = np.flatnonzero(labels == label)
-        every, number = np.unique(windows[pixels], return_inverse=True)
-        if every.size < _FEWEST:
+        cells, number = np.unique(windows[pixels], return_inverse=True)
+        if cells.size < _FEWEST:
             continue
-        scatters = np.zeros((every.size, len(noise), len(noise)))
+        scatters = np.zeros((cells.size, len(noise), len(noise)))
         np.add.at(scatters, number, np.moveaxis(survey.scatter[0][..., pixels], -1, 0))
         ratio = principal_ratio(scatters.sum(axis=0) - scatters, noise)
-        variance = (every.size - 1) * ratio.var(axis=1, keepdims=True)
+        variance = (cells.size - 1) * ratio.var(axis=1, keepdims=True)
         # For few windows widened as the interval of 95 % is, by Student's t.
-        widened = (stdtrit(every.size - 1, 0.975) / NORMAL95) ** 2
+        widened = (stdtrit(cells.size - 1, 0.975) / NORMAL95) ** 2
         inverse = energy_of_variance(ratio.mean(axis=1, keepdims=True), variance, noise)
         result[label] = widened * inverse.max()
     return result
 
 
-def _blurred(sharp: Material, less: Material, more: Material, noise: Array) -> Material:
+def _blurred(sharp: Material, base: Material, blur: Material, noise: Array) -> Material:
     """Materials with the ratios at more blur, and what the blurs have changed as a variance."""
-    wide = np.isfinite(more.ratio[-1])
-    measured = wide & np.isfinite(less.ratio[-1])
-    last, whole = (np.abs(more.ratio / before.ratio - 1.0) for before in (less, sharp))
+    wide = np.isfinite(blur.ratio[-1])
+    measured = wide & np.isfinite(base.ratio[-1])
+    step, total = (np.abs(blur.ratio / before.ratio - 1.0) for before in (base, sharp))
     # The last blur's change, or half of the whole, may be as much again beyond: of two simulated
     # vessels 94 and 95 % of the intervals hold so, 90 and 94 % by the last change alone; by the
     # whole, with 1.2 times the error, 94 and 95 %.
-    change = np.fmax(last, 0.5 * whole)
+    change = np.fmax(step, 0.5 * total)
     # A material too narrow for a blur has the median change of the others.
     usual = np.median(change[:, measured], axis=1, keepdims=True) if measured.any() else 0.0
-    ratio = np.where(wide, more.ratio, less.ratio)
+    ratio = np.where(wide, blur.ratio, base.ratio)
     off = energy_of_variance(ratio, (np.where(measured, change, usual) * ratio) ** 2, noise)
-    inverse = np.where(wide, more.inverse_energy, less.inverse_energy) + off.max(axis=0)
-    spread = np.where(wide, more.spread, less.spread)
-    return replace(less, ratio=ratio, inverse_energy=inverse, spread=spread)
+    inverse = np.where(wide, blur.inverse_energy, base.inverse_energy) + off.max(axis=0)
+    spread = np.where(wide, blur.spread, base.spread)
+    return replace(base, ratio=ratio, inverse_energy=inverse, spread=spread)
 
 
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
@@ -209,7 +209,7 @@ def shared(
     square = (value - _median(value, weight)) ** 2 * weight
     # About the median around: a slow change of what is mirrored is no noise.
     chi = np.maximum(_median(square, weight) / chdtri(1, 0.5), 1.0)
-    weight, wide = weight / chi, _AROUND * min(shape)
+    weight, wide = weight / chi, _NEIGHBOURHOOD * min(shape)
     mean = neighbour_mean(value, weight, wide)
     mean = np.where(np.isfinite(mean), mean, value)
     # Normal prior of the neighbourhood's mean and variance. Leaning does not lessen a variance:
@@ -221,8 +221,8 @@ def shared(
 
 def _median(values: Floats, weight: Floats) -> Floats:
     """Median (y, x) of the pixels around; pixels without weight count as the mean around."""
-    filled = np.where(weight > 0, values, np.nan_to_num(neighbour_mean(values, weight, _WIDE)))
-    reach = round(_WIDE)
+    filled = np.where(weight > 0, values, np.nan_to_num(neighbour_mean(values, weight, _SPAN)))
+    reach = round(_SPAN)
     # At every few pixels, then interpolated: it changes as slowly as its window is wide.
     stride = max(1, reach // 2)
     padded = np.pad(filled, reach, mode="edge")

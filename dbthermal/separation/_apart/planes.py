@@ -40,7 +40,7 @@ _DEGREE: Final = 7
 _LEAST_SHARE: Final = 1e-3  # share of a neighbourhood without which a blurred pixel is none [1]
 _STEP: Final = 0.1  # of the background, by which the slope of a bend is told [K]
 # Deviations of noise across the axis of the ratios from which the bands are apart.
-_APART: Final = 8.0
+_SIGMAS: Final = 8.0
 
 
 @dataclass(frozen=True)
@@ -68,26 +68,26 @@ class Scatters(tiles.Pixels):
     def apart(self) -> Mask:
         """Pixels whose bands do not show the same: what is across the axis is no noise."""
         bands, trace = len(self.scatter), np.einsum("bbp->p", self.scatter)
-        whole = np.moveaxis(self.scatter, -1, 0)
-        across = trace - np.linalg.eigvalsh(whole)[:, -1]
-        return np.asarray(across > _APART * np.sqrt(2.0 * (bands - 1) * self.freedom))
+        matrices = np.moveaxis(self.scatter, -1, 0)
+        remainder = trace - np.linalg.eigvalsh(matrices)[:, -1]
+        return np.asarray(remainder > _SIGMAS * np.sqrt(2.0 * (bands - 1) * self.freedom))
 
     @np.errstate(invalid="ignore", divide="ignore", over="ignore")
     def uncontradicted(self, material: tiles.Material) -> tiles.Material:
         """Material with the ratios of a pixel whose bands contradict it, or that has none."""
         white = self.freedom[:, np.newaxis, np.newaxis] * np.eye(len(self.noise))
-        whole = np.moveaxis(self.scatter, -1, 0) + white
+        matrices = np.moveaxis(self.scatter, -1, 0) + white
         # As where the second camera sees another material at p than the first at r. There the
         # method has the pixel's ratios, too (`pixel.ratios`), and pixels paired with p get the
         # object.
-        unlike = self.usable & ~reflection_ratio.agrees(whole, material.ratio / self.noise)
+        conflict = self.usable & ~reflection_ratio.agrees(matrices, material.ratio / self.noise)
         ratio = self.ratio
         inverse = reflection_ratio.inverse_energy(self.scatter, ratio, self.noise, self.freedom)
         return replace(
             material,
-            ratio=np.where(unlike, ratio, material.ratio),
-            inverse_energy=np.where(unlike, inverse, material.inverse_energy),
-            emissivity=np.where(unlike, np.nan, material.emissivity),
+            ratio=np.where(conflict, ratio, material.ratio),
+            inverse_energy=np.where(conflict, inverse, material.inverse_energy),
+            emissivity=np.where(conflict, np.nan, material.emissivity),
         )
 
 
@@ -107,17 +107,17 @@ class Planes:
     @np.errstate(invalid="ignore", divide="ignore", over="ignore")
     def combined(self, weights: Array, pixels: Any) -> tuple[Array, Array]:
         """Combination (column, pixel) [K] of the bands by weights, and its variance at a frame."""
-        whole = np.einsum("bp,bcp->cp", weights, self.smooth[..., pixels])
+        values = np.einsum("bp,bcp->cp", weights, self.smooth[..., pixels])
         noise = self.noise[0].reshape(len(weights), -1)[:, pixels]
         variance = np.maximum(((weights * noise) ** 2).sum(axis=0), reflection_ratio.TINY)
-        frames, orders = len(self.object_part), len(whole) - self.steps
-        energy = np.cumsum(whole[::-1] ** 2, axis=0)[::-1][self.steps :] / variance
+        frames, orders = len(self.object_part), len(values) - self.steps
+        energy = np.cumsum(values[::-1] ** 2, axis=0)[::-1][self.steps :] / variance
         lowest = min(reflection_ratio.LOWEST_ORDER, orders - 1)
         cost = energy[lowest:] + np.arange(lowest, orders)[:, np.newaxis] * np.log(frames)
         # As many functions as the Bayesian information criterion says, plus one.
         order = np.minimum(lowest + cost.argmin(axis=0) + 1, orders)
-        whole[np.arange(len(whole))[:, np.newaxis] >= self.steps + order] = 0.0
-        return whole, variance * (order + self.steps) / frames
+        values[np.arange(len(values))[:, np.newaxis] >= self.steps + order] = 0.0
+        return values, variance * (order + self.steps) / frames
 
     @np.errstate(invalid="ignore", divide="ignore", over="ignore")
     def scatters(self, blur: float = 0.0) -> Scatters:
@@ -131,8 +131,8 @@ class Planes:
             share = np.maximum(_smoothed(self.usable * 1.0, taps), _LEAST_SHARE)
             maps = _smoothed(maps, taps.astype(np.float32)) / share.astype(np.float32)
             # White noise before the resampling: a blur does not see what that did to it.
-            less = np.sqrt(_smoothed(self.usable * 1.0, taps**2)) / share
-            noise = (self.noise[1] * less).reshape(bands, -1)
+            factor = np.sqrt(_smoothed(self.usable * 1.0, taps**2)) / share
+            noise = (self.noise[1] * factor).reshape(bands, -1)
         flat, freedom = maps.reshape(bands, -1, pixels), self.freedom.ravel()
         scatter = np.empty((bands, bands, pixels))
         bend = self.bend * noise[0] / noise
@@ -178,8 +178,8 @@ def project(inputs: Inputs, result: xr.Dataset, emissivity: Floats, threads: Exe
                 for band, signal in enumerate(signals):
                     straight[band][:, places] = inverse @ signal
                 if inputs.difference is not None:
-                    more = inputs.difference(places)[:, frames]
-                    for band, changes in enumerate(more, 1):
+                    differences = inputs.difference(places)[:, frames]
+                    for band, changes in enumerate(differences, 1):
                         straight[band][:, places] += inverse @ changes
                 without_object(signals, x, shares, responses)
                 for images, signal in zip(maps.reshape(*maps.shape[:2], -1), signals, strict=True):
@@ -295,8 +295,8 @@ def _smooth(images: Any, result: Any, taps: Any) -> None:
     for image in range(count):
         rows[:] = 0.0
         for y in range(height):
-            for near in range(max(y - reach, 0), min(y + reach + 1, height)):
-                weight, source = taps[near - y + reach], images[image, near]
+            for line in range(max(y - reach, 0), min(y + reach + 1, height)):
+                weight, source = taps[line - y + reach], images[image, line]
                 for x in range(width):
                     rows[y, x] += weight * source[x]
             out = result[image, y]

@@ -84,8 +84,8 @@ def pooled(
         # Of a smooth object the difference changes no rapid product.
         plain = replace(inputs, difference=None) if frames.smooth else inputs
         maps = planes.project(plain, before, shares, threads)
-        every = threads.map(maps.scatters, neighbours.BLURS)
-        scatters = dict(zip(neighbours.BLURS, every, strict=True))
+        values = threads.map(maps.scatters, neighbours.BLURS)
+        scatters = dict(zip(neighbours.BLURS, values, strict=True))
         survey = partial(
             neighbours.materials, scatters=scatters, per_pixel=before, pooled=materials
         )

@@ -172,8 +172,8 @@ def filled(
         level = scenes.find_level(scene, sample)
     else:
         level = scenes.stated(scene, context.surroundings, context.surroundings_std)
-        seen = scenes.find_level(replace(scene, level=level), sample)
-        level = replace(seen, signal=level.signal, std=level.std)
+        estimate = scenes.find_level(replace(scene, level=level), sample)
+        level = replace(estimate, signal=level.signal, std=level.std)
     source = "capture" if np.any(level.std != scene.level.std) else "assumed"
     scene = replace(scene, level=level)
     del sample  # before the blocks take memory
@@ -231,8 +231,8 @@ def _complete_rows(scene: Scene, completed: xr.Dataset, lacking: Mask, rows: sli
     tile, valid = scene.tile(block, pixels[lines].ravel())
     places = np.flatnonzero(pixels) + rows.start * completed.sizes["x"]
     for start in range(0, places.size, tiles.PIXELS):
-        wanted = np.arange(start, min(start + tiles.PIXELS, places.size))
-        section = tile.select_pixels(wanted), valid[:, wanted], places[wanted]
+        batch = np.arange(start, min(start + tiles.PIXELS, places.size))
+        section = tile.select_pixels(batch), valid[:, batch], places[batch]
         _complete_pixels(scene, completed, *section)
     release()
 
@@ -244,11 +244,11 @@ def _complete_pixels(
     y, x = np.divmod(places, completed.sizes["x"])
     # A frame that was lost is no sample to complete: many captures lack some.
     arrays = [completed[name].values[:, y, x] for name in (*FILMS, *MAPS, f"{FILMS[0]}_std")]
-    wanted = np.any([(np.isnan(film) & valid).any(axis=0) for film in arrays[:2]], axis=0)
-    wanted |= np.any([np.isnan(block).any(axis=0) for block in arrays[2:4]], axis=0)
-    wanted &= valid.any(axis=0)
+    gaps = np.any([(np.isnan(film) & valid).any(axis=0) for film in arrays[:2]], axis=0)
+    gaps |= np.any([np.isnan(block).any(axis=0) for block in arrays[2:4]], axis=0)
+    gaps &= valid.any(axis=0)
     measured = np.array([arrays[0], arrays[-1]], dtype=np.float64)
-    sources = np.where(wanted, scene.source[places], -1)
+    sources = np.where(gaps, scene.source[places], -1)
     for source in (scenes.OWN, scenes.MATERIAL, scenes.PRIOR):
         chosen = sources == source
         if not chosen.any():
@@ -257,11 +257,11 @@ def _complete_pixels(
         where = source, places[chosen]
         static, variance = scenes.solve_statics(scene, block, valid[:, chosen], *where)
         if source == scenes.MATERIAL:
-            kept = ~scenes.contradicted(scene, static, places[chosen])
-            sources[chosen] = np.where(kept, source, scenes.PRIOR)
+            agreement = ~scenes.contradicted(scene, static, places[chosen])
+            sources[chosen] = np.where(agreement, source, scenes.PRIOR)
             chosen = sources == source
-            static, block = static.select_pixels(kept), block.select_pixels(kept)
-            variance = variance[kept]
+            static, block = static.select_pixels(agreement), block.select_pixels(agreement)
+            variance = variance[agreement]
         constants = static, variance, measured[..., chosen]
         values = scenes.solve(scene, block, valid[:, chosen], *constants)
         _fill(scene, completed, places[chosen], values, source)

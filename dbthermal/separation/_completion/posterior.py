@@ -37,23 +37,23 @@ from dbthermal.separation._tiles import Array, Mask, Pixels, Tile, Whole
 # Deviation of the emissivity of one sample of a material from that of the table [1].
 _SAMPLE_STD: Final = 0.02
 # Probability that the object is farther off than the camera's own reading, at most [1].
-_WORSE: Final = 0.04
+_RISK: Final = 0.04
 # Steps of Gauss-Newton, at most, and the change of the level over its deviation that ends them [1].
 _STEPS, _SETTLED = 8, 0.02
-_OTHERWISE: Final = 0.001  # chance that an object itself changes rapidly
+_CHANCE: Final = 0.001  # chance that an object itself changes rapidly
 _NEGLIGIBLE: Final = 1e-9  # share of the largest weight
 _BOUNDS: Final = (0.01, 0.999)  # of the emissivities about which the model is linearised
 _VAGUE: Final = 1e6  # where nothing bounds the fluctuation of the background: its variance [K^2]
 # Bins of time, at most, and frames in each, at least.
 _BINS: Final = 32
-_LEAST: Final = 2
+_BIN_FRAMES: Final = 2
 # Nodes of the cubic over a range of [-1, 1], its Chebyshev points; half the range, at least [K].
 _NODES: Final = np.cos(np.pi * (np.arange(4) + 0.5) / 4.0)
 _LEAST_RANGE: Final = 0.5
 # A constant, a quadratic and a cubic, at the nodes: Chebyshev's polynomials.
 _SHAPES: Final = np.cos(np.multiply.outer([0.0, 2.0, 3.0], np.arccos(_NODES)))
 # The first band's change over its noise, in variance, from which a slope is not attenuated.
-_SEEN: Final = 25.0
+_CONTRAST: Final = 25.0
 # Grid of the first emissivity for a wide prior, finer towards 1; points and reach of a narrow one.
 _GRID: Final = np.concatenate(
     [np.linspace(0.03, 0.78, 16), np.linspace(0.8, 0.97, 18), np.linspace(0.975, 0.9975, 7)]
@@ -178,7 +178,7 @@ class Curve:
 
 def bins(tile: Tile, valid: Mask) -> Bins:
     """Means of the tile's signals over bins of as many frames each."""
-    size = max(_LEAST, -(-tile.time.size // _BINS))
+    size = max(_BIN_FRAMES, -(-tile.time.size // _BINS))
     starts = np.arange(0, max(tile.time.size - size // 2, 1), size)
     frames = np.add.reduceat(valid.astype(np.float64), starts, axis=0)
     total = np.add.reduceat(np.where(valid, tile.signals, 0.0), starts, axis=1)
@@ -197,7 +197,7 @@ def curve(
     energy = (weight * centred**2).sum(axis=0)
     bins_used = np.count_nonzero(weight, axis=0)
     # Strays of the first band [K^2], beside the noise, are not followed by the other bands.
-    centred = centred * (energy > _SEEN * (tile.noise[0] ** 2 * bins_used + stray * total))
+    centred = centred * (energy > _CONTRAST * (tile.noise[0] ** 2 * bins_used + stray * total))
     half = np.maximum(np.abs(centred).max(axis=0), _LEAST_RANGE)
     base = _lagrange(centred / half)  # (node, bin, pixel)
     gram = np.einsum("ibp,bp,jbp->ijp", base, weight, base)
@@ -237,16 +237,16 @@ def _lagrange(places: Array) -> Array:
     return np.asarray(cubics)
 
 
-def _long_run(residual: Array, weight: Array, used: Array, noise: float) -> Array:
+def _long_run(residual: Array, weight: Array, count: Array, noise: float) -> Array:
     """Variance (pixel) [K^2] of a frame that gives the bins' scatter, with their correlation."""
     scaled = np.sqrt(weight) * residual
-    freedom = np.maximum(used - 4, 1)
+    freedom = np.maximum(count - 4, 1)
     variance = (scaled**2).sum(axis=0) / freedom
     power = np.maximum((scaled**2).sum(axis=0), np.finfo(np.float64).tiny)
     lags = [(scaled[lag:] * scaled[:-lag]).sum(axis=0) for lag in (1, 2) if lag < len(scaled)]
     correlated = 1.0 + 2.0 * np.sum([np.maximum(lag / power, 0.0) for lag in lags], axis=0)
-    more = variance > noise * (1.0 + 3.0 * np.sqrt(2.0 / freedom))
-    return np.asarray(np.where(more, variance * correlated, noise))
+    excess = variance > noise * (1.0 + 3.0 * np.sqrt(2.0 / freedom))
+    return np.asarray(np.where(excess, variance * correlated, noise))
 
 
 def moments(tile: Tile, data: Curve, prior: Mixture, level: Level, rapid: Array) -> Moments:
@@ -266,7 +266,7 @@ def moments(tile: Tile, data: Curve, prior: Mixture, level: Level, rapid: Array)
     covariance, spread = np.ascontiguousarray(np.moveaxis(spreads, 0, -1))
     # The blackest emissivity that is as improbable; the grid rises.
     above = np.cumsum(share.T[::-1], axis=0)[::-1] - 0.5 * share.T
-    blackest = _crossing(grid, above, _WORSE)
+    blackest = _crossing(grid, above, _RISK)
     bound = 1.0 + 2.0 * (1.0 / blackest - 1.0) if prior.weight.size > 1 else np.inf
     moved = np.minimum(mean[0], bound) - mean[0]
     mean[0] += moved
@@ -287,7 +287,7 @@ def _of_rapid(grid: Array, rapid: Array, level: Level) -> Array:
     # probable as their logarithms scatter; or the object itself changes rapidly.
     with np.errstate(divide="ignore"):
         excess = np.nan_to_num(np.maximum(np.log(rapid / level.rapid / (1.0 - grid)), 0.0))
-    return np.maximum(-0.5 * (excess / level.scatter) ** 2, math.log(_OTHERWISE))
+    return np.maximum(-0.5 * (excess / level.scatter) ** 2, math.log(_CHANCE))
 
 
 def _crossing(grid: Array, falling: Array, level: float) -> Array:
@@ -295,8 +295,8 @@ def _crossing(grid: Array, falling: Array, level: float) -> Array:
     after = np.clip((falling > level).sum(axis=0), 1, len(grid) - 1)
     ends = np.stack([after - 1, after])
     low, high = np.take_along_axis(grid, ends, axis=0)
-    more, less = np.take_along_axis(falling, ends, axis=0)
-    share = np.clip((more - level) / np.maximum(more - less, 1e-300), 0.0, 1.0)
+    top, bottom = np.take_along_axis(falling, ends, axis=0)
+    share = np.clip((top - level) / np.maximum(top - bottom, 1e-300), 0.0, 1.0)
     return np.asarray(low + share * (high - low))
 
 
@@ -311,32 +311,32 @@ def _moments(
     # Of each pixel its grid, mean and covariance of the prior's components, the background's level
     # and its deviation, the log-likelihood of rapid changes, and the parts of its `Curve`.
     grids, means, covariances, levels, mirrored, nodes, information, linear = knowledge
-    points, components, second = grids.shape[1], weight.size, means.shape[2] - 1
+    points, components, count = grids.shape[1], weight.size, means.shape[2] - 1
     # Prior and posterior of (grid, component), logarithms at first, and the precisions of c.
     density, posterior = np.empty((points, components)), np.empty((points, components))
     stiff = np.empty((points, components))
     # Mean and precision of the other emissivities before, and of the components as one.
-    normal, whole = np.empty((points, components, 2, second)), np.empty((points, 2, second))
+    normal, mixture = np.empty((points, components, 2, count)), np.empty((points, 2, count))
     # Mean of (e, c); slopes of the others with c, and their variances at a value of it.
-    values = np.empty((points, components, second + 2))
-    slope, loose = np.empty((points, components, second)), np.empty((points, components, second))
-    place, likelihood = np.empty((points, second + 2)), np.empty((points, second, 6))
+    values = np.empty((points, components, count + 2))
+    slope, loose = np.empty((points, components, count)), np.empty((points, components, count))
+    place, likelihood = np.empty((points, count + 2)), np.empty((points, count, 6))
     spare = np.empty((5, 5 * points))
     for p in range(len(grids)):
         mean, covariance = means[p], covariances[p]
         if p == 0 or np.any(mean != means[p - 1]) or np.any(covariance != covariances[p - 1]):
-            _condition((weight, mean, covariance), grids[p], density, normal, whole)
+            _condition((weight, mean, covariance), grids[p], density, normal, mixture)
         # About the best values at each point of the grid, with the components taken as one, by
         # the method of Gauss and Newton.
         for g in range(points):
-            place[g, 0], place[g, 1 + second] = grids[p, g], levels[p, 0]
-            place[g, 1 : 1 + second] = whole[g, 0]
+            place[g, 0], place[g, 1 + count] = grids[p, g], levels[p, 0]
+            place[g, 1 : 1 + count] = mixture[g, 0]
         curve, settled = (nodes[p], information[p], linear[p]), False
         for step in range(_STEPS + 1):
             _quadratic(tables, curve, place, spare, likelihood)
             if step == _STEPS or settled:
                 break
-            settled = _settled(likelihood, whole, levels[p], place, slope, loose)
+            settled = _settled(likelihood, mixture, levels[p], place, slope, loose)
         for g, k in np.ndindex(density.shape):
             values[g, k, 0] = grids[p, g]
             belief, moved = (likelihood[g], normal[g, k], levels[p]), (slope[g, k], loose[g, k])
@@ -352,12 +352,12 @@ def _moments(
 
 @kernels.allocating
 def _condition(
-    prior: tuple[Array, Array, Array], grid: Array, density: Array, normal: Array, whole: Array
+    prior: tuple[Array, Array, Array], grid: Array, density: Array, normal: Array, mixture: Array
 ) -> None:
     """Log-density of the first emissivity, and mean and precision of the others at it, in place."""
-    (weight, mean, covariance), last = prior, grid.size - 1
+    (weight, mean, covariance), end = prior, grid.size - 1
     for g in range(grid.size):
-        low, high = max(g - 1, 0), min(g + 1, last)
+        low, high = max(g - 1, 0), min(g + 1, end)
         log, off = density[g], grid[g] - mean[:, 0]
         for k in range(weight.size):
             variance = covariance[k, 0, 0]
@@ -371,21 +371,21 @@ def _condition(
         share = np.exp(log - log.max())
         share /= share.sum()
         for m in range(mean.shape[1] - 1):
-            whole[g, 0, m] = (share * normal[g, :, 0, m]).sum()
-            wide = 1.0 / normal[g, :, 1, m] + (normal[g, :, 0, m] - whole[g, 0, m]) ** 2
-            whole[g, 1, m] = 1.0 / (share * wide).sum()
+            mixture[g, 0, m] = (share * normal[g, :, 0, m]).sum()
+            wide = 1.0 / normal[g, :, 1, m] + (normal[g, :, 0, m] - mixture[g, 0, m]) ** 2
+            mixture[g, 1, m] = 1.0 / (share * wide).sum()
         log += np.log((grid[high] - grid[low]) / (high - low))  # of the cell
 
 
 @kernels.compiled
 def _settled(
-    likelihood: Array, whole: Array, level: Array, place: Array, slope: Array, loose: Array
+    likelihood: Array, mixture: Array, level: Array, place: Array, slope: Array, loose: Array
 ) -> bool:
     """Step to the best values at each point of the grid, in place; whether no level moves."""
     settled = True
     for g in range(len(place)):
         before = place[g, -1]
-        _eliminate(likelihood[g], whole[g], level, place[g], slope[g, 0], loose[g, 0])
+        _eliminate(likelihood[g], mixture[g], level, place[g], slope[g, 0], loose[g, 0])
         settled &= not abs(place[g, -1] - before) > _SETTLED * level[1]
     return settled
 
@@ -481,15 +481,15 @@ def _average(terms: tuple[Array, ...], relative: int, mean: Array, spread: Array
     size = mean.size
     offset, direction = np.empty(size), np.ones(size)
     mean[:], spread[:], direction[0] = 0.0, 0.0, 0.0
-    for second in range(2):
+    for turn in range(2):
         for g, k in np.ndindex(weights.shape):
             weight, scale = weights[g, k], 1.0 / values[g, k, 0] if relative else 1.0
             if weight == 0.0:
                 continue
             for i in range(size):
-                offset[i] = values[g, k, i] * (scale if i < size - 1 else 1.0) - mean[i] * second
-            offset[0] = (scale if relative else values[g, k, 0]) - mean[0] * second
-            if second == 0:
+                offset[i] = values[g, k, i] * (scale if i < size - 1 else 1.0) - mean[i] * turn
+            offset[0] = (scale if relative else values[g, k, 0]) - mean[0] * turn
+            if turn == 0:
                 mean += weight * offset
                 continue
             # Given e_1, c has the variance 1 / stiff, of which e_m follows a share.
@@ -507,11 +507,11 @@ def fluctuation(tile: Tile, static: Moments, means: Bins, expected: float) -> Ar
     bins_alone = replace(tile, signals=means.signals)
     free = frames.solve(bins_alone, static.point, static.level, vague)
     observed, noise = free.background, free.background_variance / np.maximum(means.frames, 1.0)
-    used = means.frames > 0
-    count = np.maximum(used.sum(axis=0), 2)
-    centre = np.where(used, observed, 0.0).sum(axis=0) / count
-    total = np.where(used, (observed - centre) ** 2, 0.0).sum(axis=0) / (count - 1)
-    noise = np.where(used, noise, 0.0).sum(axis=0) / count
+    mask = means.frames > 0
+    count = np.maximum(mask.sum(axis=0), 2)
+    centre = np.where(mask, observed, 0.0).sum(axis=0) / count
+    total = np.where(mask, (observed - centre) ** 2, 0.0).sum(axis=0) / (count - 1)
+    noise = np.where(mask, noise, 0.0).sum(axis=0) / count
     # A variance of n values is known to 2 / n of its square.
     precision = (count - 1) / (2.0 * np.maximum(total, noise) ** 2)
     # What is expected is as uncertain as it is large.

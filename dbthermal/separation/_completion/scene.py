@@ -27,7 +27,7 @@ OWN, MATERIAL, PRIOR = range(3)
 _ROOM: Final = (295.15, 8.0)
 # Fluctuation of a background that is not known [K]; least deviations of a level and of it [K].
 _FLUCTUATION: Final = 2.0
-_LEAST: Final = (0.2, 0.1)
+_FLOORS: Final = (0.2, 0.1)
 # Pixels from which the surroundings are estimated, and the residual of a result is judged.
 _SAMPLE: Final = 400
 _MOST, _FEW = 2**22, 64  # their samples in a band, at most; and fewest pixels of a long capture
@@ -84,8 +84,8 @@ class Scene:
         capture = self.inputs.capture
         numbers = np.arange(self.source.size).reshape(capture.sizes["y"], capture.sizes["x"])
         number = min(_SAMPLE, max(_FEW, _MOST // capture.sizes["time"]))
-        every = slice(None, None, max(1, int(np.sqrt(self.source.size / number))))
-        return *self.tile(capture.isel(y=every, x=every).load()), numbers[every, every].ravel()
+        grid = slice(None, None, max(1, int(np.sqrt(self.source.size / number))))
+        return *self.tile(capture.isel(y=grid, x=grid).load()), numbers[grid, grid].ravel()
 
 
 def gather(inputs: Inputs, result: xr.Dataset, pooled: xr.Dataset, prior: Any) -> Scene:
@@ -98,14 +98,14 @@ def gather(inputs: Inputs, result: xr.Dataset, pooled: xr.Dataset, prior: Any) -
     labels = np.full(source.size, -1) if inputs.labels is None else inputs.labels
     measured = (pooled["status"].values.ravel() == 0) & np.all((shared > 0) & (shared < 1), axis=0)
     for label in np.unique(labels[measured & (labels >= 0)]):
-        places, wanted = measured & (labels == label), ~sound & (labels == label)
+        places, targets = measured & (labels == label), ~sound & (labels == label)
         if places.sum() < _FEWEST:
             continue
-        value[:, wanted] = np.median(shared[:, places], axis=-1)[..., np.newaxis]
+        value[:, targets] = np.median(shared[:, places], axis=-1)[..., np.newaxis]
         # Those of the label that were not pooled tell how much its pixels differ.
         spread = np.median(shared_covariance[..., places], axis=-1) + np.cov(shared[:, places])
-        covariance[..., wanted] = spread[..., np.newaxis]
-        source[wanted] = MATERIAL
+        covariance[..., targets] = spread[..., np.newaxis]
+        source[targets] = MATERIAL
     names = [str(result["band"].values[band]) for band in bands]
     pattern = inputs.pattern[bands]
     curve = inputs.curves[bands[0]]
@@ -182,7 +182,7 @@ def solve_statics(
         data = posterior.curve(tile, means, scene.offset, stray**2, bend)
         static = posterior.moments(tile, data, prior, level, means.rapid(tile.noise[0]))
         variance = posterior.fluctuation(tile, static, means, level.fluctuation)
-    return static, np.maximum(variance, _LEAST[1] ** 2)
+    return static, np.maximum(variance, _FLOORS[1] ** 2)
 
 
 def solve(
@@ -199,10 +199,10 @@ def solve(
             moments, block = static.select_pixels(selected), tile.select_pixels(selected)
             constants = moments.emissivity, moments.level, variance[selected], moments.covariance
             samples = measured[..., selected], valid[:, selected]
-            behind = frames.background(block, *samples, *constants)
-            seen = np.isfinite(behind).all(axis=0)
-            for film, estimate in zip((background, spread), behind, strict=True):
-                film[:, selected] = np.where(seen, estimate, film[:, selected])
+            estimates = frames.background(block, *samples, *constants)
+            mask = np.isfinite(estimates).all(axis=0)
+            for film, estimate in zip((background, spread), estimates, strict=True):
+                film[:, selected] = np.where(mask, estimate, film[:, selected])
         values: Values = {}
         films = (signal, remainder + statics.shared), (background, spread)
         for name, (mean, deviation) in zip(FILMS, films, strict=True):
@@ -218,10 +218,10 @@ def solve(
 
 def contradicted(scene: Scene, static: Moments, places: Whole) -> Mask:
     """Completed pixels that tell other emissivities than their material has, by chi-square."""
-    off = (static.emissivity - scene.emissivity[:, places]).T[..., np.newaxis]
-    bands = off.shape[1]
+    difference = (static.emissivity - scene.emissivity[:, places]).T[..., np.newaxis]
+    bands = difference.shape[1]
     covariance = np.moveaxis(scene.covariance[..., places], -1, 0) + _NOTHING * np.eye(bands)
-    square = (off * np.linalg.solve(covariance, off)).sum(axis=(1, 2))
+    square = (difference * np.linalg.solve(covariance, difference)).sum(axis=(1, 2))
     return np.asarray(square > chdtri(bands, _CHANCE))
 
 
@@ -251,21 +251,21 @@ def find_level(scene: Scene, sample: Sample) -> Level:
         return scene.level
     mean, after, before, fluctuation = np.concatenate(estimates, axis=1)
     # The mean: a completed pixel may face any fluctuation; most of a scene may be at rest.
-    level = replace(scene.level, fluctuation=max(float(np.sqrt(np.mean(fluctuation))), _LEAST[1]))
+    level = replace(scene.level, fluctuation=max(float(np.sqrt(np.mean(fluctuation))), _FLOORS[1]))
     # A posterior of precision 1 / after holds the prior's 1 / before.
     variance = 1.0 / np.maximum(1.0 / after - 1.0 / before, _NOTHING)
     room, wide = float(np.mean(scene.level.signal)), float(np.mean(np.square(scene.level.std)))
     with np.errstate(over="ignore"):  # of pixels that tell nothing
         value = room + (mean - room) * variance / after
-    seen = np.isfinite(value) & (variance < before)
-    if not np.any(seen):
+    mask = np.isfinite(value) & (variance < before)
+    if not np.any(mask):
         return level
-    value, variance, pixels = value[seen], variance[seen], np.concatenate(counted)[seen]
+    value, variance, pixels = value[mask], variance[mask], np.concatenate(counted)[mask]
     # Weighted median, and the scatter that variances do not explain: how much pixels differ.
     weight = pixels / (variance + np.median(variance))
     middle = float(np.quantile(value, 0.5, weights=weight, method="inverted_cdf"))
     scatter = (MAD * float(np.median(np.abs(value - middle)))) ** 2
     between = max(scatter - float(np.median(variance)), 0.0)
-    levels = between + _MEDIAN / float(np.sum(pixels / variance)) + _LEAST[0] ** 2
+    levels = between + _MEDIAN / float(np.sum(pixels / variance)) + _FLOORS[0] ** 2
     signal = (middle * wide + room * levels) / (wide + levels)
     return replace(level, signal=signal, std=float(np.sqrt(levels * wide / (levels + wide))))

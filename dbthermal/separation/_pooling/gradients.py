@@ -29,8 +29,8 @@ Places = tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]
 """Rows and columns of pixels."""
 
 _DEGREE: Final = 4  # highest one
-_ENOUGH: Final = 4  # pixels for each coefficient, at least
-_TOGETHER: Final = 16  # pixels in a square, about, of which the sum is looked at
+_PIXELS: Final = 4  # pixels for each coefficient, at least
+_SQUARE: Final = 16  # pixels in a square, about, of which the sum is looked at
 # Condition number of the normal equations from which a degree is not determined.
 _SINGULAR: Final = 1e8
 _SMOOTH: Final = 3  # highest degree beside a step at a border
@@ -79,7 +79,7 @@ def fit(measured: Places, asked: Places, cost: Cost, degrees: int = _DEGREE) -> 
         functions = powers(measured, measured, degree)
         normal = functions.T @ (cost.square[:, np.newaxis] * functions)
         # A degree has at least four pixels to a coefficient.
-        scarce = degree > 0 and pixels < _ENOUGH * functions.shape[1]
+        scarce = degree > 0 and pixels < _PIXELS * functions.shape[1]
         if scarce or not np.linalg.cond(np.nan_to_num(normal)) < _SINGULAR:
             break
         inverse = np.asarray(np.linalg.inv(normal), dtype=np.float64)
@@ -103,12 +103,12 @@ def fit(measured: Places, asked: Places, cost: Cost, degrees: int = _DEGREE) -> 
     _, _, coefficients, residual = fits[chosen]
     value = powers(asked, measured, chosen) @ coefficients
     # A degree more may be there, unseen: beyond the pixels that tell something it matters.
-    more = min(chosen + 1, len(fits) - 1) if chosen else 0
-    functions, inverse, _, _ = fits[more]
+    order = min(chosen + 1, len(fits) - 1) if chosen else 0
+    functions, inverse, _, _ = fits[order]
     covariance = _covariance(functions, inverse, variance if chosen else cost.variance)
-    at = powers(asked, measured, more)
+    at = powers(asked, measured, order)
     remainder = replace(cost, linear=residual)
-    side = max(1, round(np.sqrt(_TOGETHER * asked[0].size / pixels)))
+    side = max(1, round(np.sqrt(_SQUARE * asked[0].size / pixels)))
     remainders = remainder, remainder.over_squares(measured, side)
     return Gradient(chosen, value, np.einsum("pi,ij,pj->p", at, covariance, at), remainders)
 
@@ -166,7 +166,7 @@ def continuous(places: Places, values: Array, variances: Array, second: Mask, le
     lowest, result = np.inf, False
     for degree in range(_SMOOTH + 1):
         functions = (degree + 1) * (degree + 2) // 2
-        if second.size < _ENOUGH * (functions + 1):
+        if second.size < _PIXELS * (functions + 1):
             break
         remainder, square, sharpness = step(places, values, variances, second, degree)
         # The least step (map,) must be one that would be seen at three standard deviations.
@@ -190,7 +190,7 @@ def powers(places: Places, measured: Places, degree: int) -> Array:
     """Products of powers (place, function) of rows and columns, from -1 to 1 at the known ones."""
     # Far from the origin, in pixels, high powers would be alike but for rounding.
     y, x = (
-        polyvander((coordinate - those.mean()) / max(float(np.ptp(those)) / 2.0, 1.0), degree).T
-        for coordinate, those in zip(places, measured, strict=True)
+        polyvander((coordinate - nodes.mean()) / max(float(np.ptp(nodes)) / 2.0, 1.0), degree).T
+        for coordinate, nodes in zip(places, measured, strict=True)
     )
     return np.stack([y[i] * x[k - i] for k in range(degree + 1) for i in range(k + 1)], axis=1)

@@ -63,7 +63,7 @@ _SMALLEST: Final = 16
 # Square of the deviations by which a ratio tells two materials apart.
 _TELLING: Final = 9.0
 _VALUES: Final = ("reflection_ratio", "emissivity", "background_temperature")
-_NEEDED: Final = ("status", *map("".join, product(_VALUES, ("", "_std"))))
+_VARIABLES: Final = ("status", *map("".join, product(_VALUES, ("", "_std"))))
 _UNUSABLE: Final = Status.INVALID_SAMPLES | Status.CONSTANT_SIGNAL | Status.DEAD_PIXEL
 
 
@@ -135,8 +135,8 @@ def materials(
     """
     result = _checked(result, corrected, error_rate, resolution)
     if "segment" in corrected:  # means across a shutter event would show the pattern's step
-        _, first, count = np.unique(corrected["segment"], return_index=True, return_counts=True)
-        frames = slice(first[count.argmax()], (first + count)[count.argmax()])  # it only rises
+        _, start, count = np.unique(corrected["segment"], return_index=True, return_counts=True)
+        frames = slice(start[count.argmax()], (start + count)[count.argmax()])  # it only rises
         corrected, result = corrected.isel(time=frames), result.isel(time=frames)
     bands, noise = _bands(result, response)
     means, variances, change = segmentation.mean_signals(corrected, response, bands, noise)
@@ -149,8 +149,8 @@ def materials(
     # Pairs whose ratios could not show a difference are compared by what they emit.
     roots = regions.roots()[pairs]
     vague = (roots[:, 0] != roots[:, 1]) & (regions.compare(*roots.T)[1] > resolution)
-    seen = np.isin(cells, pairs[vague])
-    reflected, reflected_variance = segmentation.reflected_difference(result, bands, seen)
+    mask = np.isin(cells, pairs[vague])
+    reflected, reflected_variance = segmentation.reflected_difference(result, bands, mask)
     emitted = means[1:] - means[0] - reflected
     variance = variances[1:] + variances[0] + reflected_variance
     linked, steps = _links(cells, pairs[vague], emitted, variance, change)
@@ -164,8 +164,8 @@ def without_borders(labels: xr.DataArray, result: xr.Dataset, response: xr.Datas
     """Labels (y, x) without the pixels at a border that may be of the neighbour, or of both."""
     ratios, _ = _features(result, _bands(result, response)[0])
     cells = np.asarray(labels.values + 1, dtype=np.intp)
-    every = np.arange(cells.max() + 1)[np.newaxis]
-    pooled = Regions(cells, ratios, _ERROR_RATE, _sharing(result)).pooled(every)
+    numbers = np.arange(cells.max() + 1)[np.newaxis]
+    pooled = Regions(cells, ratios, _ERROR_RATE, _sharing(result)).pooled(numbers)
     means, variances, stated = (array[:, 0] for array in pooled)
 
     def distance(regions: Labels) -> Array:
@@ -227,10 +227,10 @@ def joined(
             window = tuple(slice(max(0, low - reach), high + reach) for low, high in ends)
             roots = merged.roots()[cells[window]]
             regions = roots == first, roots == second
-            ratios, both = (array.window(window) for array in maps)
+            ratios, estimates = (array.window(window) for array in maps)
             # Regions without a step are joined too, as where an emissivity changes over a body.
-            same = segmentation.alike(*regions, ratios, both)
-            if same and segmentation.continuous(*regions, both, _RESOLUTION, reach):
+            same = segmentation.alike(*regions, ratios, estimates)
+            if same and segmentation.continuous(*regions, estimates, _RESOLUTION, reach):
                 merged.join(first, second)
                 grown = True
     return _labelled(cells, merged, per_pixel)
@@ -243,7 +243,7 @@ def _checked(
     schema.check_corrected(corrected)
     for name, value in (("error_rate", error_rate), ("resolution", resolution)):
         _numbers.real_number(name, value, _numbers.FRACTION)
-    names = [name for name in schema.STAGES["separated"] if name in _NEEDED or name in result]
+    names = [name for name in schema.STAGES["separated"] if name in _VARIABLES or name in result]
     schema.check(result, "separated", names, "the result")
     if "reflection_ratio" in result.attrs.get("not_estimated", "").split():
         label = f"method '{result.attrs.get('method')}', which estimates no reflection ratio"
@@ -254,7 +254,7 @@ def _checked(
 def _bands(result: xr.Dataset, response: xr.Dataset) -> tuple[list[int], Array]:
     """Numbers of the bands from the quietest, which is the reference, and their noise [K]."""
     names = [str(name) for name in result["band"].values]
-    slopes = [it.reference_slope for it in responses.curves(response, names)]
+    slopes = [curve.reference_slope for curve in responses.curves(response, names)]
     noise = result["noise"].values / slopes
     bands = [int(band) for band in np.argsort(noise, kind="stable")]
     return bands, noise[bands]
@@ -268,7 +268,7 @@ def _sharing(result: xr.Dataset) -> float:
 def _features(result: xr.Dataset, bands: list[int]) -> tuple[Features, Features]:
     """Ratios of all bands but the reference, without and with the reference's emissivity."""
     ratio, ratio_std, emissivity, emissivity_std = (
-        result[name].values[bands].astype(np.float64) for name in _NEEDED[1:5]
+        result[name].values[bands].astype(np.float64) for name in _VARIABLES[1:5]
     )
     features = _both(ratio[1:], ratio_std[1:] ** 2, emissivity[:1], emissivity_std[:1] ** 2)
     return Features(*(array[:-1] for array in vars(features).values())), features

@@ -29,7 +29,7 @@ Regroup: TypeAlias = Callable[[Material | None], Labels]
 """New labels (pixel) of materials, from the estimates of the materials before."""
 
 # Share of a material's pixels with an emissivity alone, from which they tell it for all [1].
-_MOST_TOLD: Final = 0.98
+_COVERAGE: Final = 0.98
 _ROUNDS: Final = 6  # rounds of leaving out pixels that are not of the material
 # Rounds of a gradient and of the pixels that are not of the material along it: in 22 simulated
 # pictures seven of rising degree are better by 2 % at most, none leaves objects 12 % further off.
@@ -37,9 +37,9 @@ _GRADED: Final = 2
 _INNER: Final = 0.8  # share of its pixels that a ratio needs; by 0.5 objects are 2 % further off
 _MAJORITY: Final = 0.5  # share of pixels with an emissivity alone that speaks for their material
 # Pixels on either side of which a resampled one is made; single ones in a material are no border.
-_REACH, _SINGLE = 2, 3
-_HARDLY: Final = 0.5  # deviation of a ratio pooled over that alone, from which it hardly helps [1]
-_MOSTLY: Final = 0.5  # share of gray pixels from which their material is [1]
+_REACH, _WINDOW = 2, 3
+_GAIN: Final = 0.5  # deviation of a ratio pooled over that alone, from which it hardly helps [1]
+_GRAY_SHARE: Final = 0.5  # share of gray pixels from which their material is [1]
 # Square of the difference in deviations that is no chance, of a pixel and of its neighbours [1].
 _UNLIKELY, _UNLIKELY_MEAN = 4.0, 1.5
 _VICINITY: Final = 1.5  # deviation of the neighbourhood that shares such errors [pixel]
@@ -72,8 +72,8 @@ class Image:
         limits: tuple[float, float] = (-np.inf, np.inf),
     ) -> gradients.Gradient:
         """Gradient at all pixels of a label within limits, from surveyed ones; `gradients.fit`."""
-        asked = np.flatnonzero(self.labels == label)
-        start, places = divmod(self.surveyed[measured], self.width), divmod(asked, self.width)
+        pixels = np.flatnonzero(self.labels == label)
+        start, places = divmod(self.surveyed[measured], self.width), divmod(pixels, self.width)
         result = gradients.fit(start, places, cost)
         # A polynomial may leave the limits beyond the surveyed pixels: then it is a constant.
         within = (result.value > limits[0]) & (result.value < limits[1])
@@ -122,20 +122,20 @@ def materials(
     sound, valid = (total(labels[places], 1.0 * holds, count) for holds in conditions)
     # Pixels with an emissivity alone are a selection by their ratios: unless they are nearly all of
     # their material, all its pixels are surveyed again, with its ratios.
-    asked = (valid <= _MOST_TOLD * sound)[labels[places]] & np.isfinite(material.ratio[-1, places])
-    if stated is not None or not np.any(asked):
+    pixels = (valid <= _COVERAGE * sound)[labels[places]] & np.isfinite(material.ratio[-1, places])
+    if stated is not None or not np.any(pixels):
         return material
-    selected[places] = asked
+    selected[places] = pixels
     # The emissivity is a guess, of constant objects alone.
     surveys = survey(inputs, replace(material, noise_variance=unknown), selected)
-    per_pixel.replace_pixels(asked, surveys.select_pixels(selected))
+    per_pixel.replace_pixels(pixels, surveys.select_pixels(selected))
     return estimate(image, labels[places], per_pixel, noise, stated)
 
 
 def _inner(labels: Labels) -> Labels:
     """Labels (pixel), -1 at the border of a material if most of its pixels lie inside."""
     # What a lens mixes agrees with either material, and biases its ratio by up to 4 deviations.
-    inner = minimum_filter(labels, _SINGLE) == maximum_filter(labels, _SINGLE)
+    inner = minimum_filter(labels, _WINDOW) == maximum_filter(labels, _WINDOW)
     within = np.bincount(labels[inner] + 1, minlength=labels.max() + 2)
     narrow = within < _INNER * np.bincount(labels.ravel() + 1)
     return np.where(inner | narrow[labels + 1], labels, -1).ravel()
@@ -145,11 +145,11 @@ def select(labels: Labels) -> Mask:
     """At most `MOST` pixels of each material, spread evenly over it, by their labels (pixel,)."""
     order = np.argsort(labels, kind="stable")
     ordered = labels[order]
-    first = np.searchsorted(ordered, ordered)
+    start = np.searchsorted(ordered, ordered)
     count = np.bincount(ordered[ordered >= 0], minlength=1)
     stride = np.maximum(1, -(-count // MOST))
     result = np.zeros(labels.shape, dtype=bool)
-    place = np.arange(ordered.size) - first
+    place = np.arange(ordered.size) - start
     result[order] = (ordered >= 0) & (place % stride[ordered] == 0)
     return result
 
@@ -164,16 +164,16 @@ def estimate(
         # The principal axis of the added scatters is the maximum of the likelihood, without the
         # bias of a mean of ratios. The emissivity is the mean of the pixels' emissivities,
         # corrected to these ratios.
-        ratio_set, used, most = _sound(labels, count, survey, noise)
+        ratio_set, inlier, removable = _sound(labels, count, survey, noise)
         if material is None:
-            common, used = _common(image, labels, (ratio_set, used, most), survey, noise)
+            common, inlier = _common(image, labels, (ratio_set, inlier, removable), survey, noise)
         else:
             # Ratios of a stated material are kept; NaN of a material without information.
             stated = np.isfinite(material.ratio[-1])
             ratio = np.where(stated, material.ratio, image.expand(ratio_set.ratio))
             variance = np.where(stated, material.inverse_energy, image.expand(ratio_set.variance))
             common = Material.of_ratios(ratio, variance, material.spread)
-        return _material(image, common, used, survey)
+        return _material(image, common, inlier, survey)
 
 
 def _usual(labels: Labels, count: int, survey: Survey) -> Survey:
@@ -196,14 +196,14 @@ def _sound(labels: Labels, count: int, survey: Survey, noise: Array) -> tuple[Ra
     surveyed = np.where(survey.frames[0] > 0, 1.0, 0.0)
     mostly_measured = total(labels, measured, count) > _MAJORITY * total(labels, surveyed, count)
     removable = np.append(mostly_measured, False)[labels]
-    used = np.where(outliers & removable, -1, labels)
+    inlier = np.where(outliers & removable, -1, labels)
     for _ in range(_ROUNDS):
-        ratio_set = _ratios(used, count, survey, noise, even=True)
-        outliers = _outliers(used, ratio_set, ratio_set.common(labels), survey, noise)
+        ratio_set = _ratios(inlier, count, survey, noise, even=True)
+        outliers = _outliers(inlier, ratio_set, ratio_set.common(labels), survey, noise)
         if not np.any(outliers):
             break
-        used = np.where(outliers, -1, used)
-    return _ratios(used, count, survey, noise), used, removable
+        inlier = np.where(outliers, -1, inlier)
+    return _ratios(inlier, count, survey, noise), inlier, removable
 
 
 def _ratios(
@@ -280,8 +280,8 @@ def _outliers(
     for order in range(1, len(survey.frames)):
         scatter = np.where(rapid, survey.scatter[order], survey.scatter[0])
         frames = np.where(rapid, survey.frames[order], survey.frames[0])
-        whole = np.moveaxis(scatter + frames * np.eye(len(noise))[..., np.newaxis], -1, 0)
-        pixel_ratio = np.where(rapid, reflection_ratio.principal_ratio(whole, noise), survey.ratio)
+        tensor = np.moveaxis(scatter + frames * np.eye(len(noise))[..., np.newaxis], -1, 0)
+        pixel_ratio = np.where(rapid, reflection_ratio.principal_ratio(tensor, noise), survey.ratio)
         inverse = reflection_ratio.inverse_energy(scatter, pixel_ratio, noise, frames)
         inverse = inverse + common.inverse_energy + common.spread
         variance = reflection_ratio.ratio_variance(pixel_ratio, inverse, noise)
@@ -293,7 +293,7 @@ def _outliers(
         distant = score > np.maximum(_OUTLIER_SIGMAS, 0.5 * farthest[labels])
         # By the deviation of the material's ratio in the pixel, too: near black, pixels that tell
         # little have ratios of a wide and skew distribution.
-        result |= distant & ~reflection_ratio.agrees(whole, whitened)
+        result |= distant & ~reflection_ratio.agrees(tensor, whitened)
     return np.asarray(result & np.isfinite(material.variance[labels]) & (survey.frames[0] > 0))
 
 
@@ -318,26 +318,26 @@ def _with_gradients(
         length, scatters = whitened @ whitened, scatter[..., pixels]
         axes = np.linalg.qr(whitened[:, np.newaxis], mode="complete")[0]
         axes *= np.sign(axes[0, 0])
-        seen = np.einsum("bi,bcp,cj->ijp", axes, scatters, axes)
-        asked, vector = np.flatnonzero(image.labels == label), axes[:, :1]
-        for number, across in enumerate(axes.T[1:], 1):
-            square, variances = seen[0, 0] - seen[number, number], seen[0, 0] + frames[pixels]
-            cost = gradients.Cost(square, seen[number, 0], variances)
+        tensor = np.einsum("bi,bcp,cj->ijp", axes, scatters, axes)
+        places, vector = np.flatnonzero(image.labels == label), axes[:, :1]
+        for number, normal in enumerate(axes.T[1:], 1):
+            square, variances = tensor[0, 0] - tensor[number, number], tensor[0, 0] + frames[pixels]
+            cost = gradients.Cost(square, tensor[number, 0], variances)
             # Between the angles at which a band's ratio would be zero.
-            zeros = axes[:, 0] / np.where(across == 0.0, np.nan, -across)
+            zeros = axes[:, 0] / np.where(normal == 0.0, np.nan, -normal)
             limits = np.nanmax(zeros[zeros < 0.0]), np.nanmin(zeros[zeros > 0.0])
             gradient = image.gradient(label, pixels, cost, limits)
             if gradient.degree > 0:
-                vector = vector + gradient.value * across[:, np.newaxis]
-                variance[asked] = np.maximum(variance[asked], length * gradient.variance)
+                vector = vector + gradient.value * normal[:, np.newaxis]
+                variance[places] = np.maximum(variance[places], length * gradient.variance)
             fits.append(gradient)
-            at.append((label, asked, length))
+            at.append((label, places, length))
         if any(gradient.degree > 0 for gradient in fits[1 - len(noise) :]):
-            ratio[:, asked] = vector * noise[:, np.newaxis] / (vector[0] * noise[0])
-    for (label, asked, length), gradient, square in zip(
+            ratio[:, places] = vector * noise[:, np.newaxis] / (vector[0] * noise[0])
+    for (label, places, length), gradient, square in zip(
         at, fits, gradients.spreads(fits), strict=True
     ):
-        spread[asked] = np.maximum(spread[asked], length * square)
+        spread[places] = np.maximum(spread[places], length * square)
         uneven[label] |= gradient.degree > 0 or square > 0
     return Material.of_ratios(ratio, variance, spread), uneven
 
@@ -346,24 +346,24 @@ def _common(
     image: Image, labels: Labels, sound: tuple[Ratios, Labels, Mask], survey: Survey, noise: Array
 ) -> tuple[Material, Labels]:
     """Ratios of all pixels with their gradients, and labels of the pixels that agree with them."""
-    ratio_set, used, removable = sound
+    pooled, inlier, removable = sound
     # Few pixels with an emissivity alone, a selection by their ratios, tell no gradient.
-    seen = np.where(removable, used, -1)
-    common, uneven = _with_gradients(image, seen, ratio_set, survey, noise)
+    subset = np.where(removable, inlier, -1)
+    common, uneven = _with_gradients(image, subset, pooled, survey, noise)
     if not np.any(uneven):
-        return common, used
+        return common, inlier
     # Along a gradient pixels far from its middle are no outliers, and the scatters, which are
     # added, have one axis only without the gradient.
     for _ in range(_GRADED):
         local = common.select_pixels(image.surveyed)
-        used = np.where(uneven[labels], labels, used)
-        used = np.where(removable & _outliers(used, ratio_set, local, survey, noise), -1, used)
-        change = ratio_set.ratio[:, labels] / local.ratio
+        inlier = np.where(uneven[labels], labels, inlier)
+        inlier = np.where(removable & _outliers(inlier, pooled, local, survey, noise), -1, inlier)
+        change = pooled.ratio[:, labels] / local.ratio
         factor = np.where(np.isfinite(change), change, 1.0)
         even = replace(survey, scatter=survey.scatter * factor[:, np.newaxis] * factor)
-        ratio_set = _ratios(used, uneven.size - 1, even, noise)
-        common, _ = _with_gradients(image, np.where(removable, used, -1), ratio_set, survey, noise)
-    return common, used
+        pooled = _ratios(inlier, uneven.size - 1, even, noise)
+        common, _ = _with_gradients(image, np.where(removable, inlier, -1), pooled, survey, noise)
+    return common, inlier
 
 
 def _material(image: Image, common: Material, labels: Labels, survey: Survey) -> Material:
@@ -380,25 +380,25 @@ def _material(image: Image, common: Material, labels: Labels, survey: Survey) ->
     # Weights 1 / (var + median var): no pixel outweighs all others by a small variance.
     typical = np.median(noise[valid]) if np.any(valid) else np.nan
     weight = np.where(valid, 1.0 / (noise + typical), 0.0)
-    whole = total(where, weight, count)
-    mean = total(where, weight * value, count) / whole
+    norm = total(where, weight, count)
+    mean = total(where, weight * value, count) / norm
     # var(mean) = sum w^2 (e - mean)^2 / (sum w)^2 n / (n - 1), at least sum w^2 var / (sum w)^2
     residual = np.where(valid, (value - mean[where]) ** 2, 0.0)
     pixels = total(where, np.ones_like(value), count)
-    scatter = total(where, weight**2 * residual, count) / whole**2
+    scatter = total(where, weight**2 * residual, count) / norm**2
     scatter *= pixels / np.maximum(pixels - 1, 1)
-    expected = total(where, weight**2 * noise, count) / whole**2
+    expected = total(where, weight**2 * noise, count) / norm**2
     # All pixels mirror the same people: var(mean) = sum_s (sum_i w k_s)^2 n / (n - 2) of n spans of
     # time, of the residual's influence k in each (Liang, Zeger 1986, doi:10.1093/biomet/73.1.13),
     # beside that of the noise (Cameron et al. 2011, doi:10.1198/jbes.2010.07136).
     spans = [total(where, weight * np.nan_to_num(span), count) for span in survey.influence]
-    timed = np.var(spans, axis=0) * len(spans) ** 2 / (len(spans) - 2) / whole**2
+    timed = np.var(spans, axis=0) * len(spans) ** 2 / (len(spans) - 2) / norm**2
     common_error = np.maximum(timed - expected, 0.0)
     result = replace(
         common,
         emissivity=image.expand(mean),
         noise_variance=image.expand(np.maximum(scatter, expected) + common_error),
-        drift_variance=image.expand(total(where, weight * drift, count) / whole),
+        drift_variance=image.expand(total(where, weight * drift, count) / norm),
     )
     return _graded(image, result, where, (value - mean[where], noise, weight))
 
@@ -447,30 +447,30 @@ def hold(
     stay = sound & (~valid | (labels.values < 0))
     if apart:
         ratios = [result["reflection_ratio_std"].values for result in (pooled, per_pixel)]
-        stay |= sound & np.any(ratios[0] > _HARDLY * ratios[1], axis=0)
+        stay |= sound & np.any(ratios[0] > _GAIN * ratios[1], axis=0)
     flags = np.uint32(Status.GRAY), np.uint32(Status.NO_BACKGROUND_MOTION)
     gray = (pooled["status"].values & flags[0]) != 0
     gray_alone, still = ((per_pixel["status"].values & flag) != 0 for flag in flags)
-    stay |= _share(labels.values, gray) > _MOSTLY
-    common, single = sound & valid & ~stay, per_pixel["object_temperature_std"].values
+    stay |= _share(labels.values, gray) > _GRAY_SHARE
+    common, stds = sound & valid & ~stay, per_pixel["object_temperature_std"].values
     # At one place nothing is added if most moving pixels of the material are gray alone.
     if not apart:
-        common &= _share(np.where(still, -1, labels.values), gray_alone) <= _MOSTLY
+        common &= _share(np.where(still, -1, labels.values), gray_alone) <= _GRAY_SHARE
     films = [result["object_temperature"].values for result in (pooled, per_pixel)]
     # Mean square D of the objects' difference, in deviations of the pixel alone.
     square, variance = np.zeros((2, *common.shape))
-    sampled = slice(None, None, max(1, len(single) // _FRAMES))
+    sampled = slice(None, None, max(1, len(stds) // _FRAMES))
     for row, columns in enumerate(map(np.flatnonzero, sound & valid)):
-        samples = (film[sampled, row].take(columns, axis=1) for film in (*films, single))
-        value, lone, std = (sample.astype(np.float64) for sample in samples)
-        square[row, columns] = np.nanmean(((value - lone) / std) ** 2, axis=0)
+        samples = (film[sampled, row].take(columns, axis=1) for film in (*films, stds))
+        value, base, std = (sample.astype(np.float64) for sample in samples)
+        square[row, columns] = np.nanmean(((value - base) / std) ** 2, axis=0)
         variance[row, columns] = np.nanmean(std**2, axis=0)
         release()
     # Of cameras apart, pixels that stay alone have their deviations widened, too.
-    unlike = np.where(stay & apart & (square > _UNLIKELY), square, 0.0)
+    excess = np.where(stay & apart & (square > _UNLIKELY), square, 0.0)
     local = np.where(common, neighbour_mean(square, common, _VICINITY), 0.0)
-    whole, size = median_filter(labels.values, _SINGLE, mode="nearest"), 1 + 2 * _REACH
-    border = minimum_filter(whole, size) < maximum_filter(whole, size)
+    regions, size = median_filter(labels.values, _WINDOW, mode="nearest"), 1 + 2 * _REACH
+    border = minimum_filter(regions, size) < maximum_filter(regions, size)
     # D times the variance alone is added if D of the pixel or around is no chance, or at a border.
     widened = common & (border | (square > _UNLIKELY) | (local > _UNLIKELY_MEAN))
     square = np.where(widened, np.maximum(square, local), 1.0 * (stay & sound))
@@ -480,13 +480,13 @@ def hold(
     maps = [(pooled[it].values, data.values) for it, data in per_pixel.items() if "x" in data.dims]
     wider = (factor > 0) | (constant > 0)
     for row in map(int, np.flatnonzero((wider | stay).any(axis=1))):
-        columns, alike = np.flatnonzero(wider[row]), np.flatnonzero(stay[row])
-        lone, std = (array[:, row].take(columns, axis=1) for array in (single, film))
-        added = factor[row, columns] * np.nan_to_num(lone) ** 2 + constant[row, columns]
+        columns, places = np.flatnonzero(wider[row]), np.flatnonzero(stay[row])
+        base, std = (array[:, row].take(columns, axis=1) for array in (stds, film))
+        added = factor[row, columns] * np.nan_to_num(base) ** 2 + constant[row, columns]
         film[:, row, columns] = np.sqrt(std**2 + added)
         for target, variable in maps:
-            target[..., row, alike] = variable[..., row, alike]
-        film[:, row, alike] *= np.sqrt(1.0 + unlike[row, alike])
+            target[..., row, places] = variable[..., row, places]
+        film[:, row, places] *= np.sqrt(1.0 + excess[row, places])
         release()
 
 

@@ -35,8 +35,8 @@ _COMPACTNESS: Final = 0.5
 _EMPTY: Final = 1e-3  # share of the largest weight below which a window holds nothing [1]
 # Difference of the ratios beside a border, relative to these, that no gradient makes [1], and in
 # deviations; variance of a median of normal values over that of their mean.
-_UNLIKE, _CERTAIN = 0.2, 3.0
-_OWN: Final = 0.08  # from the ratio of the emissivities, where the object's own changes make it
+_CONTRAST, _SIGMAS = 0.2, 3.0
+_ERROR: Final = 0.08  # from the ratio of the emissivities, where the object's own changes make it
 _MEDIAN: Final = np.pi / 2.0
 
 
@@ -181,7 +181,7 @@ class Features:
         values = np.where(weight > 0, self.values, 0.0)
         sums = (weight, weight * values, weight * values**2, weight > 0)
         size, flat = int(cells.max()) + 1, cells.ravel()
-        return np.array([[np.bincount(flat, m.ravel(), size) for m in part] for part in sums])
+        return np.array([[np.bincount(flat, m.ravel(), size) for m in term] for term in sums])
 
 
 def mixed(cells: Labels, features: Features, error_rate: float) -> Mask:
@@ -340,17 +340,17 @@ def alike(first: Mask, second: Mask, ratios: Features, maps: Features) -> bool:
 
     def near(expected: Array, ratio: Array, share: float) -> bool:
         return bool(
-            np.all(np.abs(ratio - expected) <= np.maximum(_CERTAIN * error, share * expected))
+            np.all(np.abs(ratio - expected) <= np.maximum(_SIGMAS * error, share * expected))
         )
 
-    if near(middle.mean(axis=0), middle[0], 0.5 * _UNLIKE):
+    if near(middle.mean(axis=0), middle[0], 0.5 * _CONTRAST):
         return True
     # Where a side mirrors nobody, its ratio is that of emissivities: what changes is the object.
     for region, mean, opposite in zip(sides, middle, middle[::-1], strict=True):
         values = maps.values[-1, region]
         if np.isfinite(values).any():
             emissivity = np.nanmedian(values)
-            if near((1.0 - mean * (1.0 - emissivity)) / emissivity, opposite, _OWN):
+            if near((1.0 - mean * (1.0 - emissivity)) / emissivity, opposite, _ERROR):
                 return True
     return False
 

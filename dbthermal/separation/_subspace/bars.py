@@ -54,11 +54,11 @@ def _walk(model: Model, curve_variance: float, count: int, work: Work) -> tuple[
     the bound, at the upper end of their 95 % interval,
     :math:`\mathrm{var}(e_1) = A / |u|^2 \sum_j \xi_j^2 / j^2`.
     """
-    degrees, kept, (spectrum, curve) = len(model.rising), work.spare, work.spectra
+    degrees, residual, (spectrum, curve) = len(model.rising), work.spare, work.spectra
     share = kernels.mean(work.weights)
-    for t in range(kept.size):
-        kept[t] = work.residual[t] * work.weights[t] / share
-    kernels.projected_both(model.rising, model.whole, kept, work.emitted, work.spectra)
+    for t in range(residual.size):
+        residual[t] = work.residual[t] * work.weights[t] / share
+    kernels.projected_both(model.rising, model.whole, residual, work.emitted, work.spectra)
     energy, product = kernels.dot(curve, curve), kernels.dot(curve, spectrum)
     scale, expected, upper = 0.0, 0.0, 0.0
     for j in range(degrees):
@@ -66,11 +66,11 @@ def _walk(model: Model, curve_variance: float, count: int, work: Work) -> tuple[
         spectrum[j] -= curve[j] * product / energy
     for octave in range(len(OCTAVES)):
         low, high, lost = OCTAVES[octave]
-        walk, last = 0.0, min(high - 1, degrees)
-        for j in range(low - 1, last):
+        walk, end = 0.0, min(high - 1, degrees)
+        for j in range(low - 1, end):
             noise = work.noise[0] ** 2 / share + (curve_variance if j + 1 < count else 0.0)
             walk += (j + 1.0) ** 2 * (spectrum[j] ** 2 - noise)
-        freedom = last - (low - 1) - lost
+        freedom = end - (low - 1) - lost
         if freedom > 0:
             expected = max(expected, walk / freedom)
             upper = max(upper, walk / freedom * model.widened[octave])
@@ -86,18 +86,18 @@ def _linear(model: Model, record: Any, line: Line, limit: float, work: Work) -> 
     """
     drift, frames, count = model.rising[0], work.first.size, record.order + model.steps
     emitted, residual, weights, kernel = work.emitted, work.residual, work.weights, work.kernel
-    inverse, kept = 1.0 / (regression.TUNING * line.scale), work.variance
-    kernels.copy(weights, kept)
+    inverse, factors = 1.0 / (regression.TUNING * line.scale), work.variance
+    kernels.copy(weights, factors)
     slope, level, size, length = 0.0, 0.0, 0.0, 1.0
     for turn in range(2):
         # Once more with the weights of the residual less that drift.
         for t in range(frames if turn > 0 else 0):
-            off = residual[t] - size * (drift[t] - level - slope * emitted[t])
-            kept[t] = regression.bisquare(off * inverse)
-        slope, level, _ = regression.moments(emitted, drift, kept)
+            error = residual[t] - size * (drift[t] - level - slope * emitted[t])
+            factors[t] = regression.bisquare(error * inverse)
+        slope, level, _ = regression.moments(emitted, drift, factors)
         size, length = 0.0, 0.0
         for t in range(frames):
-            kernel[t] = kept[t] * (drift[t] - level - slope * emitted[t])
+            kernel[t] = factors[t] * (drift[t] - level - slope * emitted[t])
             length += kernel[t] * drift[t]
             size += kernel[t] * residual[t]
         size /= length
@@ -136,14 +136,14 @@ def _propagate(model: Model, record: Any, epsilon: float, work: Work) -> bool:
             sensitivity[t] += factor * emitted[t]
     # What the criterion for the order leaves of the object's curve is as large as the noise that
     # one more function would have cost, log N times. The residual of a frame of rest holds both.
-    resting, more, leverage = 0.0, 1.0 + log(frames) / count, model.leverage[record.order - 1]
+    resting, margin, leverage = 0.0, 1.0 + log(frames) / count, model.leverage[record.order - 1]
     widening = 1.0 / (1.0 - NORMAL95**2 * epsilon) ** 2
     for t in range(frames):
         flat = 1.0 / work.steepness[t]
         sensitivity[t] *= flat
         smooth_variance[t] = leverage[t] * null * flat**2
         square = sensitivity[t] ** 2 * epsilon
-        expected = noise**2 + first**2 * (square + smooth_variance[t] * more)
+        expected = noise**2 + first**2 * (square + smooth_variance[t] * margin)
         resting += 1.0 if work.residual[t] ** 2 < WITHIN**2 * expected else 0.0
         work.variance[t] = square * widening + smooth_variance[t]
     return resting < RESTING * frames
@@ -168,8 +168,8 @@ def bars(model: Model, record: Any, line: Line, work: Work, covariance: Any) -> 
         for t in range(z.size):
             centred = (emitted[t] - product / total) / line.energy
             kernel[t] = weights[t] * centred
-            near = regression.bisquare(work.residual[t] * inverse)
-            record.influence[t * SPANS // z.size] += near * centred * work.residual[t]
+            factor = regression.bisquare(work.residual[t] * inverse)
+            record.influence[t * SPANS // z.size] += factor * centred * work.residual[t]
         noise_variance = line.variance
         noise_variance += first**2 * _curve_variance(model, kernel, count, null, work)
         limit = (1.0 - first) * model.drift
@@ -356,7 +356,7 @@ def _unexplained(model: Model, record: Any, work: Work, common: float) -> bool:
     with :math:`h = z_1 - r \, w_1 s_1^2 / \sigma^2` of independent noise, is a chi-square variable.
     """
     blocks, residual, rapid = model.edges.size - 1, work.null_residual, work.rapid
-    sums, together, share = work.sensitivity, 0.0, common / record.null_variance
+    sums, statistic, share = work.sensitivity, 0.0, common / record.null_variance
     products, squares = work.kernel, work.mean
     for t in range(residual.size):
         independent = rapid[t] - share * residual[t]
@@ -369,8 +369,8 @@ def _unexplained(model: Model, record: Any, work: Work, common: float) -> bool:
             product += products[t]
             square += squares[t]
         sums[block] = total
-        together += product**2 / square if square > 0 else 0.0
-    if together / record.null_variance > model.limits[0]:
+        statistic += product**2 / square if square > 0 else 0.0
+    if statistic / record.null_variance > model.limits[0]:
         return True
     edges, step = model.edges, 1
     while blocks > 1:

@@ -37,7 +37,7 @@ from dbthermal.separation._subspace.kernels import compiled
 from dbthermal.separation._tiles import Whole
 
 _LONGEST: Final = 1024  # frames of a part, at most, whose polynomials stay in the cache
-_TOGETHER: Final = 2048  # frames whose functions are made in one matrix, of their number squared
+_FRAMES: Final = 2048  # frames whose functions are made in one matrix, of their number squared
 
 
 class Tree(NamedTuple):
@@ -127,14 +127,14 @@ def divide(white: Array, time: Array, segment: Whole | None, stated: Array) -> t
     return first.mT, cost
 
 
-def _joining(most: int, event: Mask) -> Joining:
+def _joining(limit: int, event: Mask) -> Joining:
     """Work space for pieces that may begin with so many frames, at most."""
     events, degrees = int(event.sum()), pieces.FUNCTIONS
-    count, functions = most + events + event.size // _LONGEST, degrees + events
-    counts = count + 1, most + 1, most + 1
+    count, functions = limit + events + event.size // _LONGEST, degrees + events
+    counts = count + 1, limit + 1, limit + 1
     curves = count, count, count, (count, degrees), (count, degrees), (count, degrees)
     basis, equations = (degrees, _LONGEST), (functions, functions)
-    shapes = *curves, basis, equations, functions, (degrees, degrees), functions, most + 1
+    shapes = *curves, basis, equations, functions, (degrees, degrees), functions, limit + 1
     arrays: list[Any] = [np.empty(count, np.intp) for count in counts]
     return Joining(*arrays, *(np.empty(shape) for shape in shapes))
 
@@ -153,21 +153,21 @@ def _tree(times: bytes, events: bytes | None) -> Tree:
     bounds = [edges[:: 2 ** (levels - level)] for level in range(levels + 1)]
     spans = np.concatenate([np.stack([bound[:-1], bound[1:]], 1) for bound in bounds])
     if event.any():
-        every = [_functions(time[start:stop], segment[start:stop]) for start, stop in spans]
+        pairs = [_functions(time[start:stop], segment[start:stop]) for start, stop in spans]
     else:
-        every = [functions for bound in bounds for functions in _of_level(time, bound)]
-    bases = [basis for basis, _ in every]
+        pairs = [functions for bound in bounds for functions in _of_level(time, bound)]
+    bases = [basis for basis, _ in pairs]
     values = [_values(bases, i) for i in range(len(bases))]
     sizes, columns = (np.array([*map(len, rows)]) for rows in (values, [b.T for b in bases]))
     starts = [np.arange(2**level - 1, 2 ** (level + 1) - 1) for level in pieces.STARTS]
     return Tree(
         edges=spans,
         columns=columns,
-        chosen=np.array([chosen for _, chosen in every]),
+        chosen=np.array([chosen for _, chosen in pairs]),
         places=np.cumsum(sizes) - sizes,
         values=np.concatenate(values),
-        held=np.append(0, np.cumsum(np.where(np.arange(len(every)) < len(every) // 2, columns, 0))),
-        starts=np.concatenate([start for start in starts if start[-1] < len(every)]),
+        held=np.append(0, np.cumsum(np.where(np.arange(len(pairs)) < len(pairs) // 2, columns, 0))),
+        starts=np.concatenate([start for start in starts if start[-1] < len(pairs)]),
         time=time,
         event=event,
     )
@@ -175,7 +175,7 @@ def _tree(times: bytes, events: bytes | None) -> Tree:
 
 def _of_level(time: Array, edges: Whole) -> Iterator[tuple[Array, int]]:
     """Yield the `_functions` of pieces without a shutter event, between edges; quicker together."""
-    step = max(1, _TOGETHER * (len(edges) - 1) // time.size)
+    step = max(1, _FRAMES * (len(edges) - 1) // time.size)
     for group in range(0, len(edges) - 1, step):
         bounds, start = edges[group : group + step + 1], 0
         span = time[bounds[0] : bounds[-1]]
@@ -194,8 +194,8 @@ def _functions(time: Array, segment: Whole) -> tuple[Array, int]:
     order = max(1, min(smooth.PIECE_ORDER, time.size - len(steps)))
     basis = smooth.polynomial_basis(time, order)
     # Steps of the camera come first.
-    together = np.linalg.qr(np.column_stack([*steps, basis]))[0] if steps else basis
-    return together, len(steps) + (pieces.FUNCTIONS if time.size > smooth.PIECE_ORDER else order)
+    functions = np.linalg.qr(np.column_stack([*steps, basis]))[0] if steps else basis
+    return functions, len(steps) + (pieces.FUNCTIONS if time.size > smooth.PIECE_ORDER else order)
 
 
 def _values(bases: list[Array], i: int) -> Array:
@@ -243,13 +243,13 @@ def _scatters(tree: Tree, scratch: Scratch, white: Array) -> None:
             if j == tree.chosen[i]:
                 scratch.scatter[0, i], scratch.scatter[1, i], scratch.scatter[2, i] = a, b, d
             column = tree.values[tree.places[i] + j * x.size :]
-            held, cross = 0.0, 0.0
+            dot, cross = 0.0, 0.0
             for t in range(x.size):
-                held += column[t] * x[t]
+                dot += column[t] * x[t]
                 cross += column[t] * y[t]
-            a, b, d = a - held * held, b - held * cross, d - cross * cross
+            a, b, d = a - dot * dot, b - dot * cross, d - cross * cross
             if i < inner:
-                products[0, tree.held[i] + j], products[1, tree.held[i] + j] = held, cross
+                products[0, tree.held[i] + j], products[1, tree.held[i] + j] = dot, cross
         if not free:  # any curve
             a, b, d = 0.0, 0.0, 0.0
         if tree.chosen[i] >= columns or not free:
@@ -287,9 +287,9 @@ def _chosen(tree: Tree, scratch: Scratch, begins: Mask) -> tuple[float, float, f
     while n < count:
         i = reached[n]
         # Halves that cost the same may be joined.
-        whole = p * scratch.scatter[0, i] + q * scratch.scatter[1, i] + r * scratch.scatter[2, i]
-        whole += pieces.COST * tree.chosen[i] + pieces.TIE
-        if i < inner and scratch.cheapest[2 * i + 1, 0] + scratch.cheapest[2 * i + 2, 0] < whole:
+        price = p * scratch.scatter[0, i] + q * scratch.scatter[1, i] + r * scratch.scatter[2, i]
+        price += pieces.COST * tree.chosen[i] + pieces.TIE
+        if i < inner and scratch.cheapest[2 * i + 1, 0] + scratch.cheapest[2 * i + 2, 0] < price:
             reached[count], reached[count + 1] = 2 * i + 1, 2 * i + 2
             count += 2
         else:
@@ -330,18 +330,18 @@ def _part(time: Array, curve: Array, scratch: Joining, number: int) -> None:
             continue
         # Orthogonal polynomials: p_k = (x - a) p_k-1 - b p_k-2.
         previous, last = basis[max(k - 1, 0), :size], basis[max(k - 2, 0), :size]
-        following, at, square, first, held = basis[k, :size], time[start:stop], 0.0, 0.0, 0.0
+        following, at, square, first, product = basis[k, :size], time[start:stop], 0.0, 0.0, 0.0
         for t in range(size):
             x = (at[t] - middle) * scale
             value = (x - a) * previous[t] - b * last[t] if k > 0 else 1.0
             following[t] = value
             square += value * value
             first += value * value * x
-            held += value * section[t]
-        energy -= held * held / square
+            product += value * section[t]
+        energy -= product * product / square
         a, b, before = first / square, square / before if k > 0 else 0.0, square
         scratch.centre[number, k], scratch.length[number, k] = a, sqrt(square)
-        scratch.products[number, k] = held / sqrt(square)
+        scratch.products[number, k] = product / sqrt(square)
     scratch.middle[number], scratch.half[number] = middle, half
     scratch.remainder[number] = energy if size > pieces.FUNCTIONS else 0.0
 
@@ -476,11 +476,11 @@ def _pixel(tree: Tree, scratch: Scratch, white: Array, axis: Array, begins: Mask
 @compiled
 def _near(axis: Array, taken: Array, count: int, angle: float) -> bool:
     """Say whether an axis lies within an angle [rad] of an axis that is taken."""
-    near = False
+    result = False
     for i in range(count):
         product = abs(axis[0] * taken[i, 0] + axis[1] * taken[i, 1])
-        near |= acos(min(product, 1.0)) < angle
-    return near
+        result |= acos(min(product, 1.0)) < angle
+    return result
 
 
 @kernels.entered

@@ -22,7 +22,7 @@ from dbthermal.separation._tiles import Mask, Pixels, Survey, Tile, Whole
 _TURNED: Final = 2**14
 _BLOCK: Final = 8
 _VECTOR: Final = 64  # numbers that a loop takes at once, at most
-_PAGE, _APART = 512, 24  # numbers of a page, and of three lines of the cache
+_PAGE, _STAGGER = 512, 24  # numbers of a page, and of three lines of the cache
 _ZERO, _ONE, _NAN = np.float32(0.0), np.float32(1.0), np.float32(np.nan)
 _SIGMAS, _USELESS = np.float32(tiles.RANGE_SIGMAS), np.float32(tiles.USELESS)
 
@@ -277,10 +277,10 @@ def _separate(
     samples, outside, pixels = work.inside, work.outside, places.size
     block = len(samples)
     for start in range(0, pixels, block):
-        together = places[start : start + block]
-        _turn(signals, together, samples)
-        for p in range(together.size):
-            place = np.uintp(together[p])
+        batch = places[start : start + block]
+        _turn(signals, batch, samples)
+        for p in range(batch.size):
+            place = np.uintp(batch[p])
             for m in range(work.noise.size):
                 kernels.copy(samples[p, m], work.signals[m])
             kernels.copy(materials[place], work.material)
@@ -290,7 +290,7 @@ def _separate(
             _pixel(model, work, outside[p], record, solved.vectors[place], matrices[3])
             bars.judge(model, work, record, solved.sums[..., place])
             _scatters(model, work, record, matrices)
-        _return(outside, together, solved.films)
+        _return(outside, batch, solved.films)
 
 
 def share(tile: Tile, functions: smooth.Subspace, drift: float) -> Model:
@@ -350,16 +350,16 @@ def _responses(curves: tuple[Curve, ...]) -> dict[str, Any]:
 def _work_space(frames: int, bands: int, degrees: int) -> dict[str, Any]:
     """Arrays for the signals and curves of one pixel."""
     # Places of one frame that lie a multiple of a page apart would drive each other from the cache.
-    distance = -(-frames // _PAGE) * _PAGE + _APART
+    distance = -(-frames // _PAGE) * _PAGE + _STAGGER
     names = Work._fields
-    together, banded = names[1 : names.index("signals")], names[names.index("signals") :][:6]
+    curves, banded = names[1 : names.index("signals")], names[names.index("signals") :][:6]
     vectors = names[names.index("axis") : names.index("material")]
-    block, size = max(_BLOCK, _TURNED // frames), len(together)
+    block, size = max(_BLOCK, _TURNED // frames), len(curves)
     space = np.empty((size + len(banded) * bands, distance))
     rows = space[size:].reshape(len(banded), bands, distance)
     return {
         "first": rows[0, 0, :frames],  # of the signals
-        **dict(zip(together, space[:size, :frames], strict=True)),
+        **dict(zip(curves, space[:size, :frames], strict=True)),
         **dict(zip(banded, rows, strict=True)),
         **dict(zip(vectors, np.empty((len(vectors), bands)), strict=True)),
         # Whole vectors of infinite values behind the last frame: a rank is of those before.

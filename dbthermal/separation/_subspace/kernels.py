@@ -24,7 +24,7 @@ _START_ERROR: Final = 0.01  # of the inverse, of which a step of Newton leaves l
 _MARGIN: Final = 0.25  # of the calibrated range, beside it, in which they hold
 _TERMS: Final = 10  # of a polynomial
 # Degrees, and shares of the range: of a wide one, such as a maker's, the outer parts stay exact.
-_TRIED: Final = (
+_TRIALS: Final = (
     *((degree, 1.0) for degree in range(1, _TERMS)),
     *((_TERMS - 1, 0.85**k) for k in range(1, 14)),
 )
@@ -100,7 +100,7 @@ def table(curve: Curve, *second: Curve) -> Table:
     """Polynomials of a response, of the least degree that keeps an error in all bands."""
     margin = _MARGIN * (curve.highest - curve.lowest)
     widest = np.array([max(curve.lowest - margin, 0.5 * curve.lowest), curve.highest + margin])
-    for degree, share in _TRIED:
+    for degree, share in _TRIALS:
         low, high = (curve.reference + share * (widest - curve.reference)).tolist()
         dense = np.linspace(low, high, 1001)
         errors, starts = [], []
@@ -186,9 +186,9 @@ def with_slope(c: tuple[float, ...], x: float) -> tuple[float, float]:
 def mixed(u: float, a: tuple[float, ...], v: float, b: tuple[float, ...]) -> tuple[float, ...]:
     """Ten coefficients of a sum of two polynomials."""
     low = u * a[0] + v * b[0], u * a[1] + v * b[1], u * a[2] + v * b[2]
-    up = u * a[3] + v * b[3], u * a[4] + v * b[4], u * a[5] + v * b[5]
-    more = u * a[6] + v * b[6], u * a[7] + v * b[7], u * a[8] + v * b[8]
-    return low + up + more + (u * a[9] + v * b[9],)
+    mid = u * a[3] + v * b[3], u * a[4] + v * b[4], u * a[5] + v * b[5]
+    high = u * a[6] + v * b[6], u * a[7] + v * b[7], u * a[8] + v * b[8]
+    return low + mid + high + (u * a[9] + v * b[9],)
 
 
 @compiled

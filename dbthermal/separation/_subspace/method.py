@@ -77,7 +77,7 @@ _HARDLY_CHANGES: Final = np.uint32(Status.CONSTANT_OBJECT | Status.NONPHYSICAL_E
 # Ratios of two emissivities of one material [1]: 98 of 100 of the libraries lie in 0.78 to 1.21, in
 # whatever order their bands are.
 _EMITTED: Final = (0.7, 1.3)
-_LAST: Final = 6  # last orders of the smooth curve at which its polynomials may be too few
+_ORDERS: Final = 6  # last orders of the smooth curve at which its polynomials may be too few
 # Flags of pixels in which rapid changes of the object are looked for.
 _SUSPECT: Final = np.uint32(
     Status.OBJECT_NOT_SMOOTH
@@ -88,7 +88,7 @@ _SUSPECT: Final = np.uint32(
     | Status.BACKGROUND_NEVER_RESTS
 )
 # Cost of an explanation over that of the best, up to which it is preferred if it has no flag.
-_LIKELY: Final = 40.0
+_MARGIN: Final = 40.0
 # A step between two pieces is judged by what each tells, without the choice of where it ends [1].
 _AS_GIVEN: Final = (1.0 + smooth.CHANGE_POINT / smooth.PIECE_ORDER) ** -0.5
 # Pieces of a rapid object, at most, whose bands seem apart in one smooth curve.
@@ -121,24 +121,24 @@ class SubspaceSettings:
 @np.errstate(invalid="ignore", divide="ignore", over="ignore")
 def separate(tile: Tile, settings: SubspaceSettings) -> Estimate:
     """Separate one tile of two bands or more."""
-    functions, kept, drift = _functions(tile), tile.division, settings.background_drift
+    functions, starts, drift = _functions(tile), tile.division, settings.background_drift
     # A pixel keeps its division of the time from a pass before, unless it has a flag.
-    if kept is None or not kept.any():
+    if starts is None or not starts.any():
         return _searched(tile, functions, drift)
-    places = np.flatnonzero(kept.any(axis=0))
-    chosen, first = tile.select_pixels(places), kept[:, places]
+    places = np.flatnonzero(starts.any(axis=0))
+    chosen, first = tile.select_pixels(places), starts[:, places]
     solution = fused.solve(chosen, functions, drift, _parts(chosen, first, functions))
     estimate = _report(chosen, solution)
     sound = estimate.status == 0
     estimate = _finished(chosen, estimate, first, functions)
-    searched = np.ones(kept.shape[1], dtype=bool)
+    searched = np.ones(starts.shape[1], dtype=bool)
     searched[places[sound]] = False
     if not searched.any():
         return estimate
     result = _searched(tile.select_pixels(searched), functions, drift)
     result = result.select_pixels(np.maximum(np.cumsum(searched) - 1, 0))
     if result.division is None:
-        result = replace(result, division=np.zeros_like(kept))
+        result = replace(result, division=np.zeros_like(starts))
     result.replace_pixels(places[sound], estimate.select_pixels(sound))
     return result
 
@@ -177,9 +177,9 @@ def _report(tile: Tile, solution: Solution) -> Estimate:
     status |= status_bits({Status.OUTSIDE_RESPONSE: np.any(beyond, axis=0)})
     films = {name: getattr(solution, name) for name in FILMS}
     for name, film in films.items():
-        without = undefined if name.startswith("object") else no_background
-        if without.any():
-            np.copyto(film, np.nan, where=without)
+        mask = undefined if name.startswith("object") else no_background
+        if mask.any():
+            np.copyto(film, np.nan, where=mask)
     covariance = np.where(unidentified, np.nan, solution.emissivity_covariance)
     result = Estimate(
         **films,
@@ -238,11 +238,11 @@ def _flags(tile: Tile, solution: Solution) -> dict[Status, Mask]:
 def _searched(tile: Tile, functions: smooth.Subspace, drift: float) -> Estimate:
     """All steps: pixels that do not fit are solved anew with polynomials in pieces of the time."""
     solution = fused.solve(tile, functions, drift)
-    used = solution.order + functions.steps
-    asked = pieces.asked(solution.sums, tile.time, solution.null_variance, used)
-    asked |= solution.order > functions.orders - _LAST
+    number = solution.order + functions.steps
+    candidates = pieces.asked(solution.sums, tile.time, solution.null_variance, number)
+    candidates |= solution.order > functions.orders - _ORDERS
     result = _report(tile, solution)
-    suspect = np.flatnonzero(asked | ((result.status & _SUSPECT) != 0))
+    suspect = np.flatnonzero(candidates | ((result.status & _SUSPECT) != 0))
     if suspect.size == 0:
         return result
     first = np.zeros((tile.time.size, suspect.size), dtype=bool)
@@ -257,22 +257,22 @@ def _searched(tile: Tile, functions: smooth.Subspace, drift: float) -> Estimate:
     energy, count = pieces.null_energy(white, functions, pooled)
     divisions, costs = division.divide(white, tile.time, tile.segment, axis)
     # Outside the plane a function fits noise in each further band.
-    further = (pieces.COST - 1.0) * (len(noise) - 2)
-    costs += further * pieces.FUNCTIONS * divisions.sum(axis=1)
-    cost = energy + (pieces.COST + further) * count  # of one smooth curve
+    penalty = (pieces.COST - 1.0) * (len(noise) - 2)
+    costs += penalty * pieces.FUNCTIONS * divisions.sum(axis=1)
+    cost = energy + (pieces.COST + penalty) * count  # of one smooth curve
     lowest = np.minimum(cost, costs.min(axis=0))
     for divided, price in zip(divisions, costs, strict=True):
         # A sound explanation gives way to a cheaper one; a flagged one to any that is likely.
-        flagged = (best.status != 0) | (cost > lowest + _LIKELY)
-        tried = (price < cost) | (flagged & (price < lowest + _LIKELY))
+        flagged = (best.status != 0) | (cost > lowest + _MARGIN)
+        trial = (price < cost) | (flagged & (price < lowest + _MARGIN))
         # One piece is a smooth curve.
-        places = np.flatnonzero(tried & (divided.sum(axis=0) > 1))
+        places = np.flatnonzero(trial & (divided.sum(axis=0) > 1))
         if places.size == 0:
             continue
         chosen = suspects.select_pixels(places)
-        parts = _parts(chosen, divided[:, places], functions)
-        resolved = _report(chosen, fused.solve(chosen, functions, drift, parts))
-        cheaper = price[places] < cost[places] - _LIKELY
+        groups = _parts(chosen, divided[:, places], functions)
+        resolved = _report(chosen, fused.solve(chosen, functions, drift, groups))
+        cheaper = price[places] < cost[places] - _MARGIN
         better = (resolved.status == 0) | (flagged[places] & cheaper)
         places, resolved = places[better], resolved.select_pixels(better)
         best.replace_pixels(places, resolved)
@@ -284,7 +284,7 @@ def _searched(tile: Tile, functions: smooth.Subspace, drift: float) -> Estimate:
     status = best.status | np.where((best.status != 0) | hidden, asynchronous, np.uint32(0))
     # Pieces without a flag are kept for the next pass.
     first[:, hidden | ((status & ~np.uint32(Status.OBJECT_JUMP)) != 0)] = False
-    result = replace(result, division=np.zeros((tile.time.size, asked.size), dtype=bool))
+    result = replace(result, division=np.zeros((tile.time.size, candidates.size), dtype=bool))
     result.replace_pixels(suspect, replace(best, status=status))
     return result
 
@@ -299,8 +299,8 @@ def _finished(tile: Tile, estimate: Estimate, first: Mask, functions: smooth.Sub
         straight = _straight(tile.select_pixels(surveyed), estimate.select_pixels(surveyed))
     noise = tile.scaled(tile.noise)[:, surveyed]
     for place, number in enumerate(_NUMBERS if surveyed.any() else (), 1):
-        parts = _parts(tile, first[:, surveyed], functions, number)
-        estimate.replace_scatter(place, surveyed, *pieces.outside(straight, noise, parts))
+        groups = _parts(tile, first[:, surveyed], functions, number)
+        estimate.replace_scatter(place, surveyed, *pieces.outside(straight, noise, groups))
     std = _AS_GIVEN * estimate.object_temperature_std
     jumping = divided & pieces.sudden(estimate.object_temperature, std, tile.time)
     status = estimate.status | status_bits({Status.OBJECT_JUMP: jumping})
@@ -310,10 +310,10 @@ def _finished(tile: Tile, estimate: Estimate, first: Mask, functions: smooth.Sub
 def _straight(tile: Tile, estimate: Estimate) -> Array:
     """Signals (pixel, band, time) [K] less the bend of the background (eq. 11)."""
     signals, emissivity = tile.signals.copy(), estimate.emissivity
-    first = tile.blackbody(0, estimate.background_temperature)
+    reference = tile.blackbody(0, estimate.background_temperature)
     physical = np.all((emissivity > 0) & (emissivity < 1), axis=0)
     for band in range(1, len(signals)):
-        bend = tile.blackbody(band, estimate.background_temperature) - first
+        bend = tile.blackbody(band, estimate.background_temperature) - reference
         signals[band] -= np.where(physical, np.nan_to_num((1.0 - emissivity[band]) * bend), 0.0)
     return np.ascontiguousarray(signals.transpose(2, 0, 1))
 
@@ -322,10 +322,10 @@ def _parts(
     tile: Tile, first: Mask, functions: smooth.Subspace, number: int = smooth.PIECE_ORDER
 ) -> Iterator[tuple[Whole, smooth.Subspace]]:
     """Yield pixels whose pieces begin with the same frames (time, pixel), and their functions."""
-    alike: dict[bytes, list[int]] = {}
+    groups: dict[bytes, list[int]] = {}
     for place, begins in enumerate(first.T):
-        alike.setdefault(begins.tobytes(), []).append(place)
-    for places in map(np.array, alike.values()):
+        groups.setdefault(begins.tobytes(), []).append(place)
+    for places in map(np.array, groups.values()):
         begins = tile.time, first[:, places[0]], functions.rising
         yield places, smooth.piecewise(*begins, segment=tile.segment, number=number)
 

@@ -31,10 +31,10 @@ TIE: Final = 1e-6
 APART: Final = 6.0  # standard deviations between two axes that are told apart
 
 # Time in which a sudden step is so large a share of the object's change [s].
-_AROUND: Final = 1.0
-_MOST: Final = 2.0 / 3.0
+_WINDOW: Final = 1.0
+_SHARE: Final = 2.0 / 3.0
 # Parts of the capture; total variation of their means over its range, at which a signal returns.
-_PARTS: Final = 24
+_SPANS: Final = 24
 _RETURNED: Final = 1.7
 
 # Gain of the information criterion by the numbers of the frames, in units of a function's cost:
@@ -68,18 +68,18 @@ def asked(sums: Array, time: Array, variance: Array, used: Whole) -> Mask:
     # Means in units of their noise, about as many frames in each; with the curve and without.
     deviation = np.sqrt(np.where(variance > 0, variance, np.inf) / length.mean())
     places = np.add.reduceat(time, edges[:-1]) / length[:, 0]
-    left = residual / (length * deviation)
-    mean = left + curve / (length * deviation)
+    remainder = residual / (length * deviation)
+    mean = remainder + curve / (length * deviation)
     least = halves = cost = np.full((2, 1), np.inf)
     for level in range(levels - 2, -1, -1):
         # Energy outside the functions of each piece of this level, and their cost.
         means = mean.reshape(1 << level, -1, mean.shape[1])
-        held = _polynomials(places.tobytes(), len(means)).mT @ means
-        energy = np.einsum("itp,itp->ip", means, means) - np.einsum("ijp,ijp->ip", held, held)
+        terms = _polynomials(places.tobytes(), len(means)).mT @ means
+        energy = np.einsum("itp,itp->ip", means, means) - np.einsum("ijp,ijp->ip", terms, terms)
         cost = energy + COST * FUNCTIONS
         halves = least[::2] + least[1::2] if level < levels - 2 else np.full_like(cost, np.inf)
         least = np.minimum(halves, cost)
-    smoothly = (left**2).sum(axis=0) + COST * used
+    smoothly = (remainder**2).sum(axis=0) + COST * used
     return np.asarray((smoothly > least[0] + _MARGIN * COST) & (halves[0] < cost[0] + TIE))
 
 
@@ -100,15 +100,15 @@ def outside(
 
 @kernels.entered
 def _outside(
-    columns: Array, spans: Whole, signals: Array, places: Whole, held: Array, scatter: Array
+    columns: Array, spans: Whole, signals: Array, places: Whole, terms: Array, scatter: Array
 ) -> None:
     """Products of signals (pixel, band, time) outside columns (column, time), in place."""
     for p in range(places.size):
         signal = signals[places[p]]
         for m in range(len(signal)):
-            kernels.projected(columns, spans, len(columns), signal[m], held[m])
+            kernels.projected(columns, spans, len(columns), signal[m], terms[m])
             for n in range(m + 1):
-                product = kernels.dot(signal[m], signal[n]) - kernels.dot(held[m], held[n])
+                product = kernels.dot(signal[m], signal[n]) - kernels.dot(terms[m], terms[n])
                 scatter[places[p], m, n] = scatter[places[p], n, m] = product
 
 
@@ -126,11 +126,11 @@ def plane(signals: Array, noise: Array) -> tuple[Array, Array]:
 
 def null_energy(white: Array, functions: smooth.Subspace, axis: Array) -> tuple[Array, Whole]:
     """Energy across the axis of rapid changes of a `plane`, and the number of functions used."""
-    held = np.einsum("tf,btp->bfp", functions.functions, white, optimize=True)
+    terms = np.einsum("tf,btp->bfp", functions.functions, white, optimize=True)
     pairs = ((0, 0), (0, 1), (1, 1))
     a, b, d = (
         np.einsum("tp,tp->p", white[i], white[j])
-        - np.cumsum(held[i] * held[j], axis=0)[functions.steps :]
+        - np.cumsum(terms[i] * terms[j], axis=0)[functions.steps :]
         for i, j in pairs
     )
     principal = 0.5 * (a + d) - np.sqrt(0.25 * (a - d) ** 2 + b * b)
@@ -148,7 +148,7 @@ def null_energy(white: Array, functions: smooth.Subspace, axis: Array) -> tuple[
 
 def returning(signal: Array) -> Mask:
     """Pixels of a signal (time, pixel) that falls again by most of what it rose, or the reverse."""
-    starts = [it[0] for it in np.array_split(np.arange(len(signal)), min(_PARTS, len(signal)))]
+    starts = [span[0] for span in np.array_split(np.arange(len(signal)), min(_SPANS, len(signal)))]
     means = np.add.reduceat(signal, starts, axis=0) / np.diff(starts, append=len(signal))[:, None]
     # Total variation over range: 1 for a change that stays, 2 for one that comes and goes.
     variation = np.abs(np.diff(means, axis=0)).sum(axis=0)
@@ -160,7 +160,7 @@ def sudden(curve: Array, std: Array, time: Array) -> Mask:
     interval = np.diff(time)
     usual = float(np.median(interval))
     # A clock of bursts has a median far below its mean.
-    frames = min(time.size, max(3, 2 * int(np.ceil(0.5 * _AROUND / usual))))
+    frames = min(time.size, max(3, 2 * int(np.ceil(0.5 * _WINDOW / usual))))
     step = np.abs(np.diff(curve, axis=0))
     noise = np.sqrt(std[1:] ** 2 + std[:-1] ** 2)
     # By more than its deviations, and not over a pause.
@@ -169,7 +169,7 @@ def sudden(curve: Array, std: Array, time: Array) -> Mask:
     jumping, size = curve[:, result], (frames, 1)  # smooth pixels need no surroundings
     change_around = maximum_filter(jumping, size)[1:] - minimum_filter(jumping, size)[1:]
     # By more than most of its change within a second.
-    result[result] = np.any(jumps[:, result] & (step[:, result] > _MOST * change_around), axis=0)
+    result[result] = np.any(jumps[:, result] & (step[:, result] > _SHARE * change_around), axis=0)
     return np.asarray(result)
 
 
@@ -187,12 +187,12 @@ def check_clock(signals: Array, time: Array, noise: Array, segment: Whole | None
     for clock in (time, np.arange(frames, dtype=np.float64)):
         functions = smooth.largest(clock, segment)
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-            energy, used = null_energy(white, functions, any_axis)
-            chi2.append(energy / (frames - used))
+            energy, number = null_energy(white, functions, any_axis)
+            chi2.append(energy / (frames - number))
     good = (chi2[0] > 0) & (chi2[1] > 0)
     if not np.any(good):
         return
-    over_times, over_numbers = (float(np.median(part[good])) for part in chi2)
+    over_times, over_numbers = (float(np.median(values[good])) for values in chi2)
     gain = frames * np.log(chi2[0][good] / chi2[1][good]) / np.log(frames)
     gained = np.median(gain) > _GAIN + _CHANCE / np.sqrt(gain.size)
     # A reduced chi-square of f degrees of freedom has the standard deviation sqrt(2 / f).

@@ -152,13 +152,13 @@ def ratios(model: Model, work: Work, record: Any) -> None:
             )
         inverse = (1.0 - blend) * (spread + (1.0 - blend) * material[0])
     variance = null_weights(ratio, noise, work.null_weights)
-    last = work.scatter[orders - 1]
-    least, whole = _across(last, work, pooled), 0.0
+    matrix = work.scatter[orders - 1]
+    least, trace = _across(matrix, work, pooled), 0.0
     for m in range(bands):
-        whole += last[m, m]
+        trace += matrix[m, m]
     record.inverse_energy, record.null_variance = inverse, variance
     record.order, record.pooled = order + 1, pooled
-    record.contrast = (whole - least) * (bands - 1.0) / least if least > 0 else np.inf
+    record.contrast = (trace - least) * (bands - 1.0) / least if least > 0 else np.inf
     record.reduced_chi2 = null / ((bands - 1.0) * free)
 
 
@@ -171,9 +171,9 @@ def scatter(model: Model, work: Work) -> None:
         first, second = straight[m, :frames], straight[m + 1, :frames]
         kernels.projected_both(model.functions, model.spans, first, second, coefficients[m : m + 2])
     if bands % 2:
-        last, count = bands - 1, len(model.functions)
+        band, count = bands - 1, len(model.functions)
         kernels.projected(
-            model.functions, model.spans, count, straight[last, :frames], coefficients[last]
+            model.functions, model.spans, count, straight[band, :frames], coefficients[band]
         )
     # The basis is orthonormal: |P z|^2 = |z|^2 - sum of squared coefficients.
     for m in range(bands):
@@ -202,15 +202,15 @@ def _agrees(scatter: Array, axis: Array, limit: float) -> bool:
 @inlined
 def _across(scatter: Array, work: Work, pooled: float) -> float:
     """Energy of a scatter across its principal axis, or across the material's."""
-    whole, along, axis = 0.0, 0.0, work.material_axis
+    trace, along, axis = 0.0, 0.0, work.material_axis
     if pooled:
         for m in range(axis.size):
             along += axis[m] * kernels.dot(scatter[m], axis)
     else:
         along = kernels.principal(scatter, work.turned, work.turns, work.axis)
     for m in range(axis.size):
-        whole += scatter[m, m]
-    return whole - along
+        trace += scatter[m, m]
+    return trace - along
 
 
 @inlined

@@ -34,27 +34,27 @@ def ranked(values: npt.NDArray[np.float32], rank: int, guess: float) -> float:
     """Value of a rank, from 0, of values that are not negative, from a guess: no sorting."""
     # The bits of such values, as whole numbers, are in the same order, and NaN above all.
     bits = values.view(np.uint32)
-    least, most = np.float32(0.0), np.float32(values.size)
+    low_count, high_count = np.float32(0.0), np.float32(values.size)
     low, high = np.float32(0.0), np.float32(np.inf)
     middle, goal = np.float32(guess), np.float32(rank)
     for turn in range(_GUESSES):
-        below = np.float32(0.0)  # sums of one kind are taken many at once
+        count = np.float32(0.0)  # sums of one kind are taken many at once
         for t in range(values.size):
-            below += np.float32(1.0) if values[t] < middle else np.float32(0.0)
-        if below <= goal:
-            low, least = middle, below
+            count += np.float32(1.0) if values[t] < middle else np.float32(0.0)
+        if count <= goal:
+            low, low_count = middle, count
         else:
-            high, most = middle, below
-        if below == goal:
+            high, high_count = middle, count
+        if count == goal:
             break
         if high == np.float32(np.inf):  # small values are about as many in each interval
-            growth = (goal + np.float32(0.5)) / max(below, np.float32(0.5))
+            growth = (goal + np.float32(0.5)) / max(count, np.float32(0.5))
             middle = low * min(max(growth, np.float32(1.01)), np.float32(4.0))
         elif turn % 3 == 2:
             middle = np.float32(0.5) * (low + high)
         else:
             # Interpolated between the numbers of values below two bounds.
-            share = (goal + np.float32(0.5) - least) / (most - least)
+            share = (goal + np.float32(0.5) - low_count) / (high_count - low_count)
             middle = low + share * (high - low)
         if not low < middle < high:
             break
@@ -67,8 +67,8 @@ def ranked(values: npt.NDArray[np.float32], rank: int, guess: float) -> float:
 @compiled
 def bisquare(off: float) -> float:
     """Tukey's weight of a residual over the tuning constant times the scale, 0 beyond 1."""
-    inside = max(1.0 - off * off, 0.0)
-    return inside * inside
+    root = max(1.0 - off * off, 0.0)
+    return root * root
 
 
 @compiled
@@ -98,8 +98,8 @@ def reweighted(x: Any, y: Any, slope: Any, intercept: Any, scale: float) -> Any:
     total, first, second, square, product = zero, zero, zero, zero, zero
     for t in range(x.size):
         r = (y[t] - intercept - slope * x[t]) * inverse
-        kept = max(one - r * r, zero)
-        w = kept * kept
+        root = max(one - r * r, zero)
+        w = root * root
         wx = w * x[t]
         total += w
         first += wx
@@ -113,13 +113,13 @@ def reweighted(x: Any, y: Any, slope: Any, intercept: Any, scale: float) -> Any:
 
 
 @compiled
-def _started(x: Array, y: Array, noise: float, few: Any) -> tuple[float, float]:
+def _started(x: Array, y: Array, noise: float, scratch: Any) -> tuple[float, float]:
     """Slope and intercept of the best of three starts: all points, points above, below a line."""
     middle, centre = kernels.mean(x), kernels.mean(y)
     # Some points in single precision, about their mean, are enough to start from.
     count = min(x.size, STARTING_POINTS)
-    xs, ys, weights = few[0, :count], few[1, :count], few[2, :count]
-    plain, magnitude = few[3, :count], few[4, :count]
+    xs, ys, weights = scratch[0, :count], scratch[1, :count], scratch[2, :count]
+    plain, magnitude = scratch[3, :count], scratch[4, :count]
     for i in range(count):
         t = i if count == x.size else i * x.size // STARTING_POINTS
         xs[i], ys[i], weights[i] = x[t] - middle, y[t] - centre, 1.0
@@ -153,23 +153,23 @@ def _started(x: Array, y: Array, noise: float, few: Any) -> tuple[float, float]:
 
 
 @compiled
-def _weigh(x: Array, y: Array, line: Any, scale: float, weights: Array, off: Array) -> None:
+def _weigh(x: Array, y: Array, line: Any, scale: float, weights: Array, distance: Array) -> None:
     """Weights of points by a line, in place; none for neighbours of outliers, if half is kept.
 
     A reflection's edge is soft: frames next to it still hold some of it, which is no noise.
     """
-    inverse, last, whole, kept = 1.0 / (TUNING * scale), x.size - 1, 0.0, 0.0
+    inverse, end, total, support = 1.0 / (TUNING * scale), x.size - 1, 0.0, 0.0
     for t in range(x.size):
-        off[t] = abs(y[t] - line[1] - line[0] * x[t]) * inverse
-        whole += bisquare(off[t])
+        distance[t] = abs(y[t] - line[1] - line[0] * x[t]) * inverse
+        total += bisquare(distance[t])
     for t in range(x.size):
-        farthest = off[t]
+        farthest = distance[t]
         for lag in range(1, EDGE + 1):
-            farthest = max(farthest, off[max(t - lag, 0)], off[min(t + lag, last)])
-        weights[t] = bisquare(off[t]) if farthest < 1.0 else 0.0
-        kept += weights[t]
-    for t in range(x.size if kept < 0.5 * whole else 0):
-        weights[t] = bisquare(off[t])
+            farthest = max(farthest, distance[max(t - lag, 0)], distance[min(t + lag, end)])
+        weights[t] = bisquare(distance[t]) if farthest < 1.0 else 0.0
+        support += weights[t]
+    for t in range(x.size if support < 0.5 * total else 0):
+        weights[t] = bisquare(distance[t])
 
 
 @compiled
@@ -203,12 +203,12 @@ def regress(
     slope, intercept, energy = moments(x, y, weights)
     for t in range(x.size):
         residual[t] = y[t] - intercept - slope * x[t]
-    kept, lagged = (residual[0] * weights[0]) ** 2, 0.0
+    square, lagged = (residual[0] * weights[0]) ** 2, 0.0
     for t in range(1, x.size):
         weighted = residual[t] * weights[t]
-        kept += weighted * weighted
+        square += weighted * weighted
         lagged += weighted * residual[t - 1] * weights[t - 1]
-    correlation = min(max(lagged / kept if kept > 0 else 0.0, 0.0), MOST_CORRELATED)
+    correlation = min(max(lagged / square if square > 0 else 0.0, 0.0), MOST_CORRELATED)
     # Of residuals of lag-one correlation rho only (1 - rho) / (1 + rho) of the points count.
     independent = (1.0 - correlation) / (1.0 + correlation)
     return slope, scale**2 / energy / independent, scale, energy
@@ -230,10 +230,10 @@ def lines(abscissa: Array, ordinate: Any, noise: float) -> tuple[Array, Array, A
 
 @kernels.entered
 def _lines(
-    x: Array, y: Array, noise: float, weights: Array, residual: Array, few: Any, numbers: Array
+    x: Array, y: Array, noise: float, weights: Array, residual: Array, scratch: Any, numbers: Array
 ) -> None:
     """As `regress`, of many pixels (pixel, time), without a start; in place."""
     for p in range(len(x)):
         numbers[0, p], numbers[1, p], _, numbers[2, p] = regress(
-            x[p], y[p], noise, weights[p], residual, few, False
+            x[p], y[p], noise, weights[p], residual, scratch, False
         )
