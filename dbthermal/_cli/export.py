@@ -41,10 +41,11 @@ def export(options: argparse.Namespace) -> dict[str, Any]:
     outputs = {options.output: options.variable}
     if suffix in (".tif", *PICTURES) and "status" in result and options.variable != "status":
         outputs[options.output.with_stem(f"{options.output.stem}_status")] = "status"
-    summary = {}
-    for path, options.variable in outputs.items():
+    for path in outputs:
         if path.exists() and not options.overwrite:
             raise FileExistsError(f"There is something at '{path}'. Must be new, or --overwrite.")
+    summary = {}
+    for path, options.variable in outputs.items():
         with store.whole(path, suffix) as draft:
             summary[str(path)] = _WRITERS[suffix](result, draft, options)
     return summary

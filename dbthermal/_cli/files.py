@@ -154,7 +154,7 @@ def between(options: Namespace, name: str, most: int | None = None) -> slice:
     ends: list[int] = vars(options).get(name) or []
     first, end = (ends[0] if len(ends) > 1 else 0), (ends[-1] if ends else most)
     every = vars(options).get("every", 1) if name == "frames" else 1
-    if len(ends) > 2 or first < 0 or (end is not None and end <= first):
+    if len(ends) > 2 or first < 0 or (end is not None and not first < end < 2**31):
         rule = "Must be first and end, which is larger: 100 400; of frames also a number from 1"
         raise ValueError(f"Invalid --{name} {' '.join(map(str, ends))}. {rule}.")
     if every < 1:

@@ -78,8 +78,7 @@ def time_offset(corrected: xr.Dataset, *, band: str | None = None, search: int =
     TypeError or ValueError if the band is missing, the search does not fit the capture's length,
     there are fewer than 16 usable pixels, nothing moves in both bands, their covariance is greatest
     at an end of the search, the bands share less than half of their frames, the offset is not known
-    within 0.1 frame, a clock was set while it ran, or times are not of exposure, as of frames in
-    bursts.
+    within 0.1 frame, a clock was set while it ran, or times are of arrival, in bursts.
 
     Parameters
     ----------

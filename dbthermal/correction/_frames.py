@@ -102,8 +102,7 @@ def unreported(corrected: xr.Dataset, valid: Mask, renewals: Mask) -> Findings:
     band deviates alike. Of two gains, by which noise and contrast, or the pattern, change at once
     in one band, the rarer is bad. A pattern steps if the means before and after differ from pixel
     to pixel, at once, for longer, and in one band. `renewals` (band, time) are first frames after
-    marked events. Of 4e5 good frames of 48 kinds of scenes at 2 to 50 Hz less than 2e-4 are taken
-    for bad ones.
+    marked events. Of 4e5 good frames of 48 scenes at 2 to 50 Hz, below 2e-4 are taken for bad ones.
     """
     counts = corrected["counts"]
     good = (schema.pixel_status(corrected) & np.uint32(schema.Status.DEAD_PIXEL)) == 0

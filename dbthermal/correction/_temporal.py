@@ -35,8 +35,7 @@ def find_shutter(corrected: xr.Dataset, *, closed: xr.DataArray | None = None) -
     """Find the runs of frames in which a band repeats its image.
 
     A frame is a copy if no pixel differs from the frame before: some thousands of pixels first,
-    then the whole image in blocks of rows. The search is exact only before anything is interpolated
-    in time.
+    then the whole image in blocks of rows. It is exact only before an interpolation in time.
 
     TypeError or ValueError if `closed` is no boolean of the frames, or in a band fewer than 16 of
     the pixels compared ever change.
@@ -112,8 +111,7 @@ def mark_shutter(corrected: xr.Dataset, events: xr.Dataset | None = None) -> xr.
     A `segment` is the time between two renewals of the offsets, at which every pixel of the band
     steps by tens of counts, which no camera reports. The step stays in the counts:
     `separation.solve` fits it in each pixel and band. Events of two bands that overlap, or follow
-    without a frame between, are one step. An event before the first or after the last valid frame
-    makes none.
+    without a frame between, are one step; those before or after all valid frames are none.
 
     An event costs accuracy: beside five functions over 35 s, one step in the middle raises the
     standard deviation of the smooth part by 1.9, two, at 11 and 24 s, by 2.7.
@@ -276,8 +274,7 @@ def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.D
     -------
     Dataset
         The dataset with other `counts` [count], and the attributes ``lag_time_constant`` [s] and
-        ``lag_noise_amplification`` [1], each by band; a known noise must be multiplied by the
-        latter.
+        ``lag_noise_amplification`` [1], each by band, which multiplies a known noise.
     """
     counts = schema.check_corrected(corrected)["counts"]
     if "lag_time_constant" in corrected.attrs:

@@ -128,7 +128,9 @@ def array(
         rule = f"Must lie within valid_range, {low:g} to {high:g}: beyond, none was measured"
         raise ValueError(f"Invalid counts of '{label}', {counts.min()} to {counts.max()}. {rule}.")
     sentences += [it for rate in rates for it in _recording.another_rate(rate, stamps, label)]
-    origin = schema.origin(attributes)
+    labels = schema.MEASURED, "simulated", "emulated"  # others are no label of measurement
+    stated = str(attributes.get("origin")).startswith(labels)
+    origin = schema.origin(attributes) if stated else {}
     return _recording.clocked(counts, stamps, label, *sentences, format="array", **origin)
 
 
@@ -155,8 +157,8 @@ def _checked(values: Any, label: str, unit: str) -> dict[str, Any]:
         rule = "Must be counts: if it is, rename the array or its long_name"
         raise ValueError(f"Invalid array of '{label}', named '{named.group()}'. {rule}.")
     ends = [attributes.get("valid_min", 0), attributes.get("valid_max", 2**16 - 1)]
-    low, high = np.ravel(attributes.get("valid_range", ends)).astype(float) % 2**16  # with signs
-    attributes["valid_range"] = low, high
+    ends, name = attributes.get("valid_range", ends), f"valid_range of '{label}'"
+    attributes["valid_range"] = _numbers.real_numbers(name, ends, shape=(2,)) % 2**16  # with signs
     text = str(attributes.get("units", attributes.get("unit", unit))).strip()
     _recording.check_unit(unit if text in {"", "1"} else text, label)
     return attributes
@@ -215,7 +217,8 @@ def _attribute(values: Any, name: str) -> Any:
         return None
     most = 2 if name.lower() == "valid_range" else 1
     if hasattr(attrs, "get_id") and math.prod(attrs.get_id(name).shape) > most:
-        raise ValueError(f"Invalid attribute '{name}', a list. Must be one value.")
+        rule = "Must be two values" if most == 2 else "Must be one value"
+        raise ValueError(f"Invalid attribute '{name}', a list. {rule}.")
     value = attrs[name]
     value = value.reshape(-1)[0] if isinstance(value, np.ndarray) and value.size == 1 else value
     return value.decode() if isinstance(value, bytes) else value

@@ -116,11 +116,12 @@ def damage_named(label: str, rule: str) -> Iterator[None]:
         rule = "Must be readable, and closed by other programs: wait for its writer, or copy it"
         raise type(error)(f"Unreadable {label.partition(' ')[2]}: {error}. {rule}.") from error
     except DAMAGE as error:
-        refused = isinstance(error, ValueError) and "Must " in str(error)
+        refused = isinstance(error, TypeError | ValueError) and "Must " in str(error)
         if refused and label.partition("'")[2] in str(error):
             raise
-        message = f"{' '.join(str(error).split())[:200]}. Must be {rule}."
-        raise ValueError(f"{label}: {error if refused else message}") from error
+        message = f"{label}: {' '.join(str(error).split())[:200]}. Must be {rule}."
+        refusal = f"Refused {label.partition(' ')[2]}: {error}"
+        raise ValueError(refusal if refused else message) from error
 
 
 def check_present(counts: Counts, fills: Sequence[Any], name: str) -> None:
@@ -236,7 +237,8 @@ def check_times(values: npt.NDArray[Any], unit: str, clock: Clock | None, name: 
     rises = np.diff(seconds, prepend=-1.0) > 0
     if not np.all(valid := rises if clock is None else rises & agrees):
         first = int(np.argmin(valid))
-        mismatch = f"frame {first} at {seconds[first]:g} s, by clock= at {stated[first]:g}"
+        unit = "s" if values.dtype.kind in "mM" else word or "of no unit"
+        mismatch = f"frame {first} at {apart[first]:g} {unit}, by clock= at {stated[first]:g}"
         rule = "Must agree to half a frame, and rise: leave clock= out, or numbers of frames"
         if not rises[first]:
             mismatch = f"frame {first} at {seconds[first]:g} s, after {seconds[first - 1]:g} s"

@@ -160,8 +160,7 @@ def _are_longer(counts: Counts) -> bool:
 def sequence(path: str | Path, *, clock: Clock | None = None, memory: float = MEMORY) -> xr.Dataset:
     """Counts of a recording in an .sfmov of FLIR or an .hcc of Telops.
 
-    Result and errors are as from `array`; ValueError, too, if the numbers are temperatures or
-    radiances.
+    Result and errors are as from `array`; ValueError, too, for temperatures or radiances.
 
     Parameters
     ----------

@@ -61,8 +61,7 @@ _THRESHOLD: Final = 0.1  # motion of a band that matters, rms [pixel]: two depth
 _SIDES, _MARGIN, _SAMPLES = (8, 32), 6, 2**24
 _TURNS, _STEP, _SETTLED = 6, 2.0, 0.02
 _SEARCHED, _REPEATS = 2, 2  # turns in which ratios are sought, and rounds of the weights
-# Ratios that are tried, of reflectivities; and the variance over that of noise of a pixel that
-# counts half.
+# Tried ratios of reflectivities; variance, over that of noise, of a pixel that counts half.
 _RATIOS: Final = np.exp(np.append(np.linspace(-1.2, -0.15, 4), np.linspace(0.15, 1.5, 9)))
 _HALF: Final = 4.0
 # Flags that motion brings about, and the share of the pixels that have them, or a remainder: of

@@ -129,8 +129,7 @@ def bridge(counts: Array, valid: Mask, time: Array) -> tuple[Array, Mask]:
     before = np.maximum.accumulate(np.where(valid[:, selected], places, -len(valid)))[frame, place]
     after = np.where(valid[::-1, selected], places, -len(valid))
     after = len(valid) - 1 - np.maximum.accumulate(after)[::-1][frame, place]
-    # A line between near frames, the same in all bands: they hold the same mixture of object and
-    # background.
+    # A line between near frames, the same in all bands, which mix object and background alike.
     longest = max(LONGEST_GAP, int(LONGEST_SHARE * len(valid)))
     short = after - before <= longest + 1
     frame, pixel, start, end = (band[short] for band in (frame, pixel, before, after))

@@ -185,7 +185,7 @@ def test_dims_of_netcdf_without_variables(tmp_path: Path) -> None:
         ([0, 1 / 600, 1 / 300], "minutes since 2024-05-06 07:08:09", ""),
         ([0, 100_000, 200_000], "usec", ""),
         ([0, 10**8, 2 * 10**8], None, ""),
-        ([0.0, 0.1, 0.2], "h", "frame 1 at 360 s"),
+        ([0.0, 0.1, 0.2], "h", "frame 1 at 0.1 h"),
     ],
 )
 def test_times_of_an_array_agree_with_the_clock(

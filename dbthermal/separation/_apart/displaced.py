@@ -29,8 +29,7 @@ from dbthermal.separation._quality import Bits
 _ROUNDS: Final = 100
 _SOLVED: Final = 1e-3
 _UNSOLVED: Final = 1e-2
-# A place so far outside of the image is told by its border, as a shift that is known may be off by
-# so much [pixel].
+# A place so far outside of the image is told by its border: a known shift may be off so [pixel].
 _OUTSIDE: Final = 0.2
 _LOST_WEIGHT: Final = 0.25  # weight of pixels without a value that good pixels may take over [1]
 # Share of the pixels of some rows up to which pixels are read singly: a shift that is as wide as
