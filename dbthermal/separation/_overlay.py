@@ -42,8 +42,8 @@ _REACH, _NEARLY = 4, 0.9
 _WINDOWS, _FEWEST = 64, 4  # windows, of most detail; with detail that both bands show, at least
 # Share of a window's detail that the bands have in common, at least; and share of all else that a
 # displacement leaves at the best blur, at most, by so much less per pixel; at each blur less than
-# all. So 18 of 24 scenes are displaced by 0.3 pixel and 72 of 72 by 1 or 2, and of 260 smooth
-# objects none, of which noise that looks alike at the finest blur alone displaced 23.
+# all. So 18 of 24 scenes are displaced by 0.3 pixel and 72 of 72 by 1 or 2, and of 350 with little
+# detail none, of which noise that looks alike at the finest blur alone displaced 23.
 _SHARE, _REMAINDER, _FALL = 0.5, 0.9, 0.25
 _PRIOR: Final = 2.0  # deviation [pixel] of a parameter
 _TURNS, _SETTLED, _STEP = 8, 0.01, 1.0  # steps at most; rms that ends them; longest [pixel]
