@@ -453,6 +453,7 @@ def test_curves_films_pictures(results: Path) -> None:
     (results / "out.tif").unlink()
     line = refused(results, "export", "result.zarr", "-o", "out.tif")
     assert "There is something at 'out_status.tif'" in line
+    assert not (results / "out.tif").exists()
     with xr.open_dataset(results / "out.nc", engine="scipy") as opened:
         np.testing.assert_array_equal(opened["object_temperature"], object_)
         np.testing.assert_array_equal(opened["status"], result["status"])

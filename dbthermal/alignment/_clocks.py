@@ -130,8 +130,7 @@ def fill_times(stamps: Array) -> Array:
     ----------
     stamps : Array
         Times (time) [s], NaN where a frame is missing; before the first and after the last by a
-        frame period each. TypeError or ValueError if they are no numbers, fewer than two, or do not
-        increase.
+        frame period each. TypeError or ValueError if they are no two numbers, or do not increase.
     """
     stamps = _numbers.real_numbers("exposure times [s]", stamps)
     label = "exposure times of the camera"

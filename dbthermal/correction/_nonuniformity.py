@@ -115,8 +115,7 @@ def fit_correction(
     of n temperatures, or, of two temperatures, that of the noise over the number of frames.
 
     TypeError or ValueError if there are fewer than two temperatures, threshold or `maximum` are out
-    of range, no more than half of the pixels of a band are usable, or the mean does not rise with
-    temperature.
+    of range, half of the pixels of a band or more are unusable, or the mean falls with temperature.
 
     Parameters
     ----------

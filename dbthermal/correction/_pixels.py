@@ -66,8 +66,7 @@ def mark_bad(corrected: xr.Dataset, *, threshold: float = OUTLIER) -> xr.Dataset
     corrected : Dataset
         Stage `corrected` of `schema`, after `mark_shutter`; read in blocks of rows.
     threshold : float
-        Limit of the robust z-score of the noise, and of a jump relative to the noise of a
-        difference [1].
+        Limit of the robust z-score of the noise, and of a jump over the noise of a difference [1].
 
     Returns
     -------

@@ -257,8 +257,7 @@ def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.D
 
     The first frame becomes NaN, and so does a frame after one that is NaN. White noise is raised by
     :math:`\sqrt{1 + a^2} / (1 - a)` (1.00005 at 10 Hz, 1.25 at 60 Hz for 10 ms), and successive
-    frames then have the correlation :math:`-a / (1 + a^2)`: undo a lag that matters, not one that
-    does not.
+    frames then have the correlation :math:`-a / (1 + a^2)`: undo only a lag that matters.
 
     TypeError or ValueError if there are fewer than two frames, the lag was undone before, the
     counts are whole numbers, or a time constant is not positive, or above 1 s.
@@ -316,8 +315,7 @@ def undo_drift(
     and 350 frames. A motion in front of the patch, or reflected in it, is taken for drift.
 
     TypeError or ValueError if the drift was undone before, the reference marks no good pixel,
-    `order` is no whole number from 2 to that of the frames, or a part of the patch is NaN in a
-    frame.
+    `order` is no whole number from 2 to that of the frames, or a part of the patch is NaN.
 
     Parameters
     ----------

@@ -141,9 +141,9 @@ def _offsets(cameras: Sequence[xr.Dataset], offset: Any) -> list[float]:
 def _names(bands: Any, number: int) -> list[str]:
     """Names of the bands, which must be different texts, as many as stated."""
     listed = [*bands] if isinstance(bands, list | tuple | np.ndarray) else []
-    names = [str(name) for name in listed if isinstance(name, str) and name.strip()]
+    names = [str(name) for name in listed if isinstance(name, str) and name.strip() == name != ""]
     if not len({*names}) == len(listed) == number:
-        raise ValueError(f"Invalid bands {bands!r}. Must be {number} different names, as texts.")
+        raise ValueError(f"Invalid bands {bands!r}. Must be {number} different names, trimmed.")
     return names
 
 
@@ -152,7 +152,9 @@ def _unchanging(samples: list[npt.NDArray[np.uint16]], names: list[str]) -> list
     stills, sentences = [(sample == sample[0]).all(axis=0) for sample in samples], list[str]()
     for still, name in zip(stills, names, strict=True):
         rows, columns = (int(still.all(axis=axis).sum()) for axis in (1, 0))
-        if rows < len(still) and rows + columns:
+        if rows == len(still):
+            sentences.append(f"Band '{name}' never changes. Must be live: does its camera hang?")
+        elif rows + columns:
             label = f"Rows ({rows}), columns ({columns}) of band '{name}' never change"
             sentences.append(f"{label}: a border. Its pixels are flagged; better cropped.")
     drawn = np.all(stills, axis=0)

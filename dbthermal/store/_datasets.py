@@ -248,9 +248,12 @@ def open_dataset(path: str | Path) -> xr.Dataset:
 
 
 def _open(checked: integrity.CheckedStore, leave: Iterable[str] = ()) -> xr.Dataset:
-    dataset: xr.Dataset = xr.open_zarr(
-        checked, chunks=None, consolidated=False, zarr_format=3, drop_variables=list(leave)
-    )
+    options: dict[str, Any] = {"chunks": None, "consolidated": False, "zarr_format": 3}
+    try:
+        dataset: xr.Dataset = xr.open_zarr(checked, drop_variables=list(leave), **options)
+    except KeyError as error:  # of arrays without names of their dims
+        rule = "Must be of dbthermal; readers.array and 'dbthermal import' read others"
+        raise ValueError(f"Invalid store '{checked.root}'. {rule}.") from error
     return dataset
 
 

@@ -529,8 +529,15 @@ def test_times_are_as_many_as_frames(tmp_path: Path) -> None:
         file.create_dataset("time", (10**9,), "f8", chunks=(10**6,)).make_scale("time")
         file["frames"].dims[0].attach_scale(file["time"])
     assert_refused(r"Invalid number 1000000000 of times .* Must be 3", read, tmp_path / "a.h5")
-    with pytest.raises(ValueError, match="Invalid attribute 'units', a list"):
-        read(hdf5(tmp_path / "a.h5", _units=["count", "K"]))
+    assert_refused(
+        "^Refused 'a.h5': .* 'units'", read, hdf5(tmp_path / "a.h5", _units=["count"] * 2)
+    )
+    limits = hdf5(tmp_path / "a.h5", _valid_range=[1, 2, 3])
+    assert_refused("^Refused 'a.h5': .* 'valid_range', a list. Must be two values", read, limits)
+    with pytest.raises(
+        TypeError, match="^Invalid valid_range of 'a.h5' 'zero'. Must be a"
+    ):
+        read(hdf5(tmp_path / "a.h5", _valid_min="zero"))
 
 
 def netcdf(path: Path, version: int, *, records: bool, time: bool = False) -> Path:

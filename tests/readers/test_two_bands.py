@@ -51,6 +51,14 @@ def test_a_text_that_is_drawn_into_the_images_is_named() -> None:
         joined()
 
 
+def test_a_camera_that_hangs_is_noticed() -> None:
+    """All frames of one band are the same image."""
+    films = scene(20), np.broadcast_to(scene(20)[:1] + np.uint16(7), scene(20).shape)
+    cameras = [readers.array(film, unit="count", clock=10.0) for film in films]
+    with pytest.warns(UserWarning, match=r"^Band '9\.5' never changes\. Must be live"):
+        readers.two_bands(*cameras, bands=BANDS, offset=0.0)
+
+
 def test_a_border_is_noticed() -> None:
     """Rows and columns that pad an image are counted in a warning, which stays with the capture."""
     pads = ((0, 0), (4, 4), (0, 3))
@@ -148,6 +156,7 @@ test_arguments_that_make_no_capture = refused(
         ("offset", True, r"Invalid offset \[s\] True\. Must be a number"),
         ("bands", "ab", "Invalid bands 'ab'. Must be 2 different names"),
         ("bands", ("a", "a"), r"Invalid bands \('a', 'a'\). Must be 2 different names"),
+        ("bands", ("a", "b "), "Must be 2 different names, trimmed"),
         *(
             ("bands", one, "Invalid bands")
             for one in ((8.0, 9.5), ("a", "b", "c"), ("a", " "), None)

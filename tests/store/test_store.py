@@ -11,6 +11,7 @@ import av
 import numpy as np
 import pytest
 import xarray as xr
+import zarr
 from captures import plain_capture
 from hypothesis import given
 from hypothesis import strategies as st
@@ -109,6 +110,9 @@ def test_opening_reads_no_values(capture: xr.Dataset, tmp_path: Path) -> None:
     assert_refused(r"Since it was opened, replaced file 'counts/c/0/0/0/0'", opened.load)
     with pytest.raises(FileNotFoundError, match=r"No dataset '.*b\.zarr'"):
         store.open_dataset(tmp_path / "b.zarr")
+    zarr.open_group(tmp_path / "c.zarr", mode="w").create_array("a", shape=(2, 3), dtype="u2")
+    with pytest.warns(UserWarning, match="No checksums"):
+        assert_refused("c.zarr'. Must be of dbthermal", store.open_dataset, tmp_path / "c.zarr")
 
 
 def test_figures(tmp_path: Path) -> None:
