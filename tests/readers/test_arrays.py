@@ -534,9 +534,7 @@ def test_times_are_as_many_as_frames(tmp_path: Path) -> None:
     )
     limits = hdf5(tmp_path / "a.h5", _valid_range=[1, 2, 3])
     assert_refused("^Refused 'a.h5': .* 'valid_range', a list. Must be two values", read, limits)
-    with pytest.raises(
-        TypeError, match="^Invalid valid_range of 'a.h5' 'zero'. Must be a"
-    ):
+    with pytest.raises(TypeError, match="Invalid valid_range of 'a"):
         read(hdf5(tmp_path / "a.h5", _valid_min="zero"))
 
 
