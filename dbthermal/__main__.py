@@ -1,8 +1,7 @@
 """Command line of dual-band thermal videography: ``dbthermal``, or ``python -m dbthermal``.
 
 Exit status: 0 if done, 1 if refused, with the reason in one line, 2 if the command is not
-understood, 130 if it was interrupted. The summary goes to the standard output, all else to the
-standard error.
+understood, 130 if interrupted. The summary goes to standard output, all else to standard error.
 """
 
 import argparse

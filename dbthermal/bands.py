@@ -63,8 +63,7 @@ class Band:
     def nodes(self) -> tuple[Array, Array]:
         """Gauss-Legendre nodes (node) [m], increasing, and weights (node) [m], over the band.
 
-        The weights add up to the band's width. With 40 nodes the integral of Planck's law over 8-14
-        um is exact to rounding.
+        The weights add up to the width. Planck's law over 8-14 um is integrated to rounding.
         """
         return self.centre + 0.5 * self.width * _NODES, 0.5 * self.width * _WEIGHTS
 

@@ -10,17 +10,17 @@ HOUSE = Path(dbthermal.__file__).parent
 
 # Lines and modules that a room may have. A room that grows takes from another; these only fall.
 BUDGET = {
-    "": (3469, 15),
-    "_cli": (1252, 5),
+    "": (3467, 15),
+    "_cli": (1253, 5),
     "alignment": (2798, 10),
     "calibration": (738, 2),
-    "correction": (1696, 5),
+    "correction": (1695, 5),
     "emissivity": (402, 1),
     "explorer": (1254, 6),
     "figures": (582, 2),
     "instruments": (5194, 19),
     "limits": (659, 2),
-    "readers": (2773, 10),
+    "readers": (2775, 10),
     "reporting": (362, 1),
     "separation": (12749, 45),
     "simulation": (523, 1),

@@ -155,7 +155,8 @@ def between(options: Namespace, name: str, most: int | None = None) -> slice:
     first, end = (ends[0] if len(ends) > 1 else 0), (ends[-1] if ends else most)
     every = vars(options).get("every", 1) if name == "frames" else 1
     if len(ends) > 2 or first < 0 or (end is not None and not first < end < 2**31):
-        rule = "Must be first and end, which is larger: 100 400; of frames also a number from 1"
+        rule = "Must be first and end, which is larger and below 2^31: 100 400"
+        rule += "; or one number from 1" if name == "frames" else ""
         raise ValueError(f"Invalid --{name} {' '.join(map(str, ends))}. {rule}.")
     if every < 1:
         raise ValueError(f"Invalid --every {every}. Must be 1 or more.")

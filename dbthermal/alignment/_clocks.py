@@ -130,7 +130,7 @@ def fill_times(stamps: Array) -> Array:
     ----------
     stamps : Array
         Times (time) [s], NaN where a frame is missing; before the first and after the last by a
-        frame period each. TypeError or ValueError if they are no two numbers, or do not increase.
+        frame period each. TypeError or ValueError if there are fewer than two, or they fall.
     """
     stamps = _numbers.real_numbers("exposure times [s]", stamps)
     label = "exposure times of the camera"
@@ -218,9 +218,9 @@ def interpolation(stamps: Array, present: Mask, wanted: Array, segment: Whole) -
     in_a_row = np.pad(joined & (np.diff(usable) == 1), (1, 1))
     four = between & in_a_row[right - 1] & in_a_row[right] & in_a_row[right + 1]
     # Bend: the cubic through four frames in a row (Lagrange), less the line.
-    nodes, unit = times[right[four, np.newaxis] + np.arange(-2, 2)], np.eye(4, dtype=bool)
+    nodes, same = times[right[four, np.newaxis] + np.arange(-2, 2)], np.eye(4, dtype=bool)
     away, spacing = wanted[four, np.newaxis] - nodes, nodes[:, :, np.newaxis] - nodes[:, np.newaxis]
     bend = np.zeros((wanted.size, 4))
-    bend[four] = np.prod(np.where(unit, 1.0, away[:, np.newaxis] / (spacing + unit)), axis=2)
+    bend[four] = np.prod(np.where(same, 1.0, away[:, np.newaxis] / (spacing + same)), axis=2)
     bend[four, 1:3] -= np.stack([1.0 - weight[four], weight[four]], axis=1)
     return Interpolation(usable[right - 1], usable[right], weight, bend, valid, stamps)

@@ -117,15 +117,15 @@ def _whole_pixels(
         shifted = [energies[0][rows, right : right + width] for right in range(gain.shape[2])]
         gain /= np.maximum(images.blurred(np.stack(shifted, axis=-1), WINDOW), freedom)
         if down == reach[0]:
-            origin = gain[..., reach[1]]
+            at_rest = gain[..., reach[1]]
         right, highest = gain.argmax(axis=2), gain.max(axis=2)
         better = highest > best
         best[better], place[0][better], place[1][better] = highest[better], down, right[better]
     # Products of two blurred noises are alike over an area of 2 pi BLUR^2.
     chance = _SIGNIFICANT * 2.0 * np.pi * BLUR**2 / (4.0 * np.pi * WINDOW**2)
-    unmoved = best - origin <= chance
+    unmoved = best - at_rest <= chance
     place[:, unmoved] = np.reshape(reach, (2, 1))
-    best = np.where(unmoved, _UNMOVED * origin, best - origin)
+    best = np.where(unmoved, _UNMOVED * at_rest, best - at_rest)
     # Weight: share of the movies' energy in a window that is explained.
     share = best / np.maximum(images.blurred(np.sum(energies[1:], axis=0), WINDOW), 1e-9)
     return place - np.reshape(reach, (2, 1, 1)), np.where(best > chance, share, 0.0)
@@ -133,9 +133,9 @@ def _whole_pixels(
 
 def on_valid(places: Array, valid: Mask) -> Mask:
     """Places (2, ...) that lie on valid pixels of an image."""
-    grid = np.rint(places)
-    result = np.all([(n >= 0) & (n < size) for n, size in zip(grid, valid.shape, strict=True)], 0)
-    row, column = np.where(result, grid, 0).astype(np.intp)
+    pixels = np.rint(places)
+    result = np.all([(n >= 0) & (n < size) for n, size in zip(pixels, valid.shape, strict=True)], 0)
+    row, column = np.where(result, pixels, 0).astype(np.intp)
     return np.asarray(result & valid[row, column])
 
 

@@ -115,7 +115,7 @@ def fit_correction(
     of n temperatures, or, of two temperatures, that of the noise over the number of frames.
 
     TypeError or ValueError if there are fewer than two temperatures, threshold or `maximum` are out
-    of range, half of the pixels of a band or more are unusable, or the mean falls with temperature.
+    of range, half of the pixels of a band or more are unusable, or the mean does not rise.
 
     Parameters
     ----------
@@ -180,8 +180,7 @@ def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
     image of unknown temperature says nothing of it (`undo_drift` does). `offset_std` becomes that
     of an image as noisy as one of the calibration's. The attribute ``offset_renewed`` is 1.
 
-    TypeError or ValueError if bands or pixels are not the same, or a good pixel is not finite or
-    its gain not positive.
+    TypeError or ValueError if bands or pixels differ, or a good pixel is infinite or its gain is 0.
 
     Parameters
     ----------

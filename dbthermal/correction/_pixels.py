@@ -201,11 +201,11 @@ def _repeats(movie: xr.DataArray, frames: Mask) -> tuple[Mask, Mask]:
             statistics = (end, number, _samples.near_end(counts, valid, end, grain))
             ends[int(highest), :, rows, columns] = np.reshape(statistics, (3, *shape))
     moving = ends[0, 0] < ends[1, 0]
-    for sign, (end, number, trials) in zip((-1, 1), ends, strict=True):
-        clipped |= moving & _samples.is_heap(number, trials, grain)
+    for sign, (end, number, near) in zip((-1, 1), ends, strict=True):
+        clipped |= moving & _samples.is_heap(number, near, grain)
         # A level at which several pixels have their extremes is the camera's: it clips all of them.
         level = end == sign * np.max(sign * end[moving], initial=-np.inf)
-        many, about = (values[level].sum() + 1 - level.sum() for values in (number, trials))
+        many, about = (values[level].sum() + 1 - level.sum() for values in (number, near))
         clipped |= level & _samples.is_heap(many, about, grain)  # one sample of each makes its end
     return clipped, frozen & moving
 
@@ -255,12 +255,12 @@ def _changes(signal: Single, stepped: Mask) -> tuple[Single, Single]:
         change[stepped] = 0.0
         return change, change
     places = np.arange(len(signal))[:, np.newaxis, np.newaxis]
-    origin = np.maximum.accumulate(np.where(valid, places, 0), axis=0)[:-1]
+    previous = np.maximum.accumulate(np.where(valid, places, 0), axis=0)[:-1]
     with np.errstate(invalid="ignore"):
-        change = signal[1:] - np.take_along_axis(signal, origin, axis=0)
+        change = signal[1:] - np.take_along_axis(signal, previous, axis=0)
     segment = np.concatenate([[0], np.cumsum(stepped)])
-    change[(segment[places[1:]] != segment[origin]) | ~np.isfinite(change)] = 0.0
-    gap = (places[1:] - origin).astype(np.float32)
+    change[(segment[places[1:]] != segment[previous]) | ~np.isfinite(change)] = 0.0
+    gap = (places[1:] - previous).astype(np.float32)
     return np.where(gap > _LONGEST_GAP + 1, np.float32(0.0), change / gap), change
 
 

@@ -35,7 +35,7 @@ def find_shutter(corrected: xr.Dataset, *, closed: xr.DataArray | None = None) -
     """Find the runs of frames in which a band repeats its image.
 
     A frame is a copy if no pixel differs from the frame before: some thousands of pixels first,
-    then the whole image in blocks of rows. It is exact only before an interpolation in time.
+    then the whole image by rows. The search is exact only before an interpolation in time.
 
     TypeError or ValueError if `closed` is no boolean of the frames, or in a band fewer than 16 of
     the pixels compared ever change.
@@ -273,7 +273,7 @@ def undo_lag(corrected: xr.Dataset, time_constant: float | xr.DataArray) -> xr.D
     -------
     Dataset
         The dataset with other `counts` [count], and the attributes ``lag_time_constant`` [s] and
-        ``lag_noise_amplification`` [1], each by band, which multiplies a known noise.
+        ``lag_noise_amplification`` [1], each by band; multiply a known noise by it.
     """
     counts = schema.check_corrected(corrected)["counts"]
     if "lag_time_constant" in corrected.attrs:

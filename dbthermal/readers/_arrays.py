@@ -128,9 +128,10 @@ def array(
         rule = f"Must lie within valid_range, {low:g} to {high:g}: beyond, none was measured"
         raise ValueError(f"Invalid counts of '{label}', {counts.min()} to {counts.max()}. {rule}.")
     sentences += [it for rate in rates for it in _recording.another_rate(rate, stamps, label)]
-    labels = schema.MEASURED, "simulated", "emulated"  # others are no label of measurement
-    stated = str(attributes.get("origin")).startswith(labels)
-    origin = schema.origin(attributes) if stated else {}
+    origin, labels = schema.origin(attributes), (schema.MEASURED, "simulated", "emulated")
+    if origin and not origin["origin"].strip().lower().startswith(labels):
+        rule = f"Must begin with one of {[*labels]}: it is taken for measured"
+        sentences.append(f"Unknown origin '{origin.pop('origin')}' of '{label}'. {rule}.")
     return _recording.clocked(counts, stamps, label, *sentences, format="array", **origin)
 
 
@@ -157,8 +158,9 @@ def _checked(values: Any, label: str, unit: str) -> dict[str, Any]:
         rule = "Must be counts: if it is, rename the array or its long_name"
         raise ValueError(f"Invalid array of '{label}', named '{named.group()}'. {rule}.")
     ends = [attributes.get("valid_min", 0), attributes.get("valid_max", 2**16 - 1)]
-    ends, name = attributes.get("valid_range", ends), f"valid_range of '{label}'"
-    attributes["valid_range"] = _numbers.real_numbers(name, ends, shape=(2,)) % 2**16  # with signs
+    limits = np.ravel(attributes.get("valid_range", ends))
+    name = f"valid_range, or valid_min and valid_max, of '{label}'"
+    attributes["valid_range"] = _numbers.real_numbers(name, limits, shape=(2,)) % 2**16  # signed
     text = str(attributes.get("units", attributes.get("unit", unit))).strip()
     _recording.check_unit(unit if text in {"", "1"} else text, label)
     return attributes

@@ -221,7 +221,7 @@ def check_times(values: npt.NDArray[Any], unit: str, clock: Clock | None, name: 
     word = unit.partition(" since ")[0].strip()
     scales = [scale for text, scale in _SECONDS.items() if re.fullmatch(text, word, re.IGNORECASE)]
     if values.dtype.kind in "mM":
-        values, scales = (values - values[0]) / np.timedelta64(1, "s"), [1.0]
+        word, values, scales = "s", (values - values[0]) / np.timedelta64(1, "s"), [1.0]
     elif not word:
         scales = [1.0] if clock is None else [*_SECONDS.values()]  # in days, of tables
         step = abs(float(values[-1]) - float(values[0])) / max(len(values) - 1, 1)
@@ -237,8 +237,8 @@ def check_times(values: npt.NDArray[Any], unit: str, clock: Clock | None, name: 
     rises = np.diff(seconds, prepend=-1.0) > 0
     if not np.all(valid := rises if clock is None else rises & agrees):
         first = int(np.argmin(valid))
-        unit = "s" if values.dtype.kind in "mM" else word or "of no unit"
-        mismatch = f"frame {first} at {apart[first]:g} {unit}, by clock= at {stated[first]:g}"
+        moment = f"{apart[first]:g} {word or '(no unit)'}"
+        mismatch = f"frame {first} at {moment}, by clock= at {stated[first]:g} s"
         rule = "Must agree to half a frame, and rise: leave clock= out, or numbers of frames"
         if not rises[first]:
             mismatch = f"frame {first} at {seconds[first]:g} s, after {seconds[first - 1]:g} s"

@@ -143,18 +143,18 @@ def _names(bands: Any, number: int) -> list[str]:
     listed = [*bands] if isinstance(bands, list | tuple | np.ndarray) else []
     names = [str(name) for name in listed if isinstance(name, str) and name.strip() == name != ""]
     if not len({*names}) == len(listed) == number:
-        raise ValueError(f"Invalid bands {bands!r}. Must be {number} different names, trimmed.")
+        raise ValueError(f"Invalid bands {bands!r}. Must be {number} different trimmed texts.")
     return names
 
 
 def _unchanging(samples: list[npt.NDArray[np.uint16]], names: list[str]) -> list[str]:
-    """Sentences on pixels that never change: rows and columns of a band, or places of all bands."""
+    """Sentences on pixels that never change: a band, its rows and columns, or places of all."""
     stills, sentences = [(sample == sample[0]).all(axis=0) for sample in samples], list[str]()
     for still, name in zip(stills, names, strict=True):
         rows, columns = (int(still.all(axis=axis).sum()) for axis in (1, 0))
-        if rows == len(still):
+        if rows == len(still) and len(samples[0]) > 1:
             sentences.append(f"Band '{name}' never changes. Must be live: does its camera hang?")
-        elif rows + columns:
+        elif rows < len(still) and rows + columns:
             label = f"Rows ({rows}), columns ({columns}) of band '{name}' never change"
             sentences.append(f"{label}: a border. Its pixels are flagged; better cropped.")
     drawn = np.all(stills, axis=0)

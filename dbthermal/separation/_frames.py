@@ -291,7 +291,7 @@ def background(
               r = c + g (\bar r_0 - c) + k (r_0 - \bar r_0)
 
     The object's error is common to all frames: it makes the mean over time uncertain, which leans
-    on the level c, and not the change about it. NaN without an object temperature; as `solve`.
+    on the level c, and not the change about it. NaN where no object is; else as in `solve`.
     """
     curve, e, dark = tile.curves[0], emissivity[0], 1.0 - emissivity[0]
     signal = curve.signal(measured[0]) - tile.reference

@@ -282,8 +282,8 @@ def decide_noise(
         subsample, frames = quality.sample(capture, _NOISE_PIXELS)
         linear = [curve.linearise(band) for curve, band in zip(curves, subsample, strict=True)]
         noise = noises.estimate_bands(linear, capture["time"].values[frames])
-    array = "band", noise / factor * slopes, schema.NOISE.attrs
-    return response.sel(band=names).assign(noise=array).assign_attrs(noise_source="capture"), noise
+    field = "band", noise / factor * slopes, schema.NOISE.attrs
+    return response.sel(band=names).assign(noise=field).assign_attrs(noise_source="capture"), noise
 
 
 def _check_clock(capture: xr.Dataset, method: Method, curves: list[Curve], noise: Array) -> None:

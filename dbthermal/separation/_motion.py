@@ -205,8 +205,8 @@ def _rapid(corrected: xr.Dataset, inputs: Inputs) -> Array:
         if np.sqrt(np.mean(steps**2)) < _SETTLED:
             break
     # The motion of lost frames is interpolated between the frames before and after.
-    times, places = np.arange(frames.size), np.flatnonzero(frames)
-    motion[bands] = np.apply_along_axis(lambda course: np.interp(times, places, course), 1, path)
+    numbers, places = np.arange(frames.size), np.flatnonzero(frames)
+    motion[bands] = np.apply_along_axis(lambda course: np.interp(numbers, places, course), 1, path)
     return motion
 
 

@@ -41,9 +41,9 @@ _BLURS: Final = (2.0, 1.0, 0.5)  # deviations, from coarse to fine [pixel]
 _REACH, _NEARLY = 4, 0.9
 _WINDOWS, _FEWEST = 64, 4  # windows, of most detail; with detail that both bands show, at least
 # Share of a window's detail that the bands have in common, at least; and share of all else that a
-# displacement leaves at the best blur, at most, by so much less per pixel; at each blur less than
-# all. So 18 of 24 scenes are displaced by 0.3 pixel and 72 of 72 by 1 or 2, and of 350 with little
-# detail none, of which noise that looks alike at the finest blur alone displaced 23.
+# displacement leaves at its best blur, at most: 0.9, less 0.25 for each of its first 1.6 pixels. So
+# 18 of 24 scenes are displaced by 0.3 pixel, 84 of 84 by 1 to 4, and of 350 with little detail
+# none, of which noise that looks alike at the finest blur alone displaced 23.
 _SHARE, _REMAINDER, _FALL = 0.5, 0.9, 0.25
 _PRIOR: Final = 2.0  # deviation [pixel] of a parameter
 _TURNS, _SETTLED, _STEP = 8, 0.01, 1.0  # steps at most; rms that ends them; longest [pixel]
@@ -257,9 +257,9 @@ class _Views:
         images = [map_coordinates(spline, sources, **options) for spline in self.splines]
         values = _detail(np.array(images))
         shared = np.sum(self.detail * values, axis=(0, 2))
-        windows = shared**2 > _SHARE * self.energy * np.sum(values**2, axis=(0, 2))
+        agreement = shared**2 > _SHARE * self.energy * np.sum(values**2, axis=(0, 2))
         scale = quotient(shared, self.energy, 0.0)
-        return scale, values - scale[:, np.newaxis] * self.detail, windows
+        return scale, values - scale[:, np.newaxis] * self.detail, agreement
 
 
 def _displacement(first: Array, second: Array, drift: Array, noise: Array) -> tuple[Array, Array]:
@@ -287,19 +287,19 @@ def _displacement(first: Array, second: Array, drift: Array, noise: Array) -> tu
         if level is None:
             break
         levels.append(views)
-        path, spread, windows = level
+        path, spread, agreement = level
         # The coarsest detail tells where to begin; finer detail counts if most windows show it
         # (with fewer, 1 of 400 scenes was moved that lay right), or if it is the finest.
-        if blur == _BLURS[-1] or (blur < _BLURS[0] and np.mean(windows) > 0.5):
+        if blur == _BLURS[-1] or (blur < _BLURS[0] and np.mean(agreement) > 0.5):
             finest = path, spread
     if finest is None:
         return zero, zero
     path, spread = finest
-    # Compare what the bands do not have in common with the motion and without it, in all windows,
-    # most of which a motion of reflections spoils.
+    # Compare what the bands do not have in common with the motion and without it, in all windows
+    # at all blurs: moving reflections spoil most windows; noise looks alike at one blur only.
     squares = [[np.sum(it.compared(shift)[1] ** 2) for it in levels] for shift in (path, zero)]
-    shares = np.divide(squares[0], squares[1])
-    explained = shares.max() < 1.0 and shares.min() < _REMAINDER - _FALL * size_of(path)
+    shares = quotient(np.array(squares[0]), np.array(squares[1]), 1.0)
+    explained = shares.max() < 1.0 and shares.min() < _REMAINDER - _FALL * min(size_of(path), 1.6)
     # A growth is no evidence: heat that spreads feigns it.
     sure = np.any(quotient(path**2, spread, 0.0)[:-1] > SURE)
     # No motion that is unsure, too small to matter, or does not explain the difference.
@@ -309,17 +309,17 @@ def _displacement(first: Array, second: Array, drift: Array, noise: Array) -> tu
 def _refined(views: _Views, path: Array, variance: Array) -> tuple[Array, Array, Mask] | None:
     """Motion (parameter) [pixel] by Gauss-Newton, its variance, and windows alike; None of few."""
     for _ in range(_TURNS):
-        scale, remainder, windows = views.compared(path)
-        if np.count_nonzero(windows) < _FEWEST:
+        scale, remainder, agreement = views.compared(path)
+        if np.count_nonzero(agreement) < _FEWEST:
             return None
         least = variance[1] + scale**2 * variance[0]
-        weight = (scale / np.maximum(np.mean(remainder**2, axis=(0, 2)), least))[windows]
-        slopes, residual = views.slopes[:, :, windows], remainder[:, windows]
-        form = np.einsum("w,afwp,bfwp->wab", weight * scale[windows], slopes, slopes)
+        weight = (scale / np.maximum(np.mean(remainder**2, axis=(0, 2)), least))[agreement]
+        slopes, residual = views.slopes[:, :, agreement], remainder[:, agreement]
+        form = np.einsum("w,afwp,bfwp->wab", weight * scale[agreement], slopes, slopes)
         force = np.einsum("w,afwp,fwp->wa", weight, slopes, residual)
         prior, before = np.eye(len(slopes)) / _PRIOR**2, np.append(path, [0.0, 0.0])
         step, spread = (values[:PARAMETERS] for values in jackknife(form, force, prior, before))
         path = path + np.clip(step, -_STEP, _STEP)
         if np.sqrt(np.mean(step**2)) < _SETTLED:
             break
-    return path, spread, windows
+    return path, spread, agreement

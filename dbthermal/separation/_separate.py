@@ -40,9 +40,9 @@ if TYPE_CHECKING:
     from dbthermal.separation._subspace.method import SubspaceSettings
 
 _UNEXPLAINED: Final = (
-    "In {:.0%} of the image parts with moving reflections the bands do not show the same at the "
-    "same time, and no shift of the reflections explains it. If an object is heated in steps, or "
-    "rows or columns share noise, the intervals hold; if the cameras stand apart and a pixel "
+    "In {:.0%} of what mirrors motion the bands do not show the same at the same time, and no "
+    "shift of the reflections explains it. If an object is heated in steps, or rows or columns "
+    "share noise, the intervals held in simulations; if the cameras stand apart and a pixel "
     "mirrors several depths, or their clocks differ, those of pixels without a flag are too small."
 )
 _ROUNDS: Final = 3  # in which motion is undone
@@ -207,7 +207,7 @@ def _on_one_clock(
             aligned = alignment.align(capture, clock=names[0])
     except ValueError:  # nothing tells the clocks: the pixels keep the flag
         return unchanged
-    # Nor does one clock show what a delay too short to matter would explain.
+    # A delay too short to matter explains nothing: the clocks stay as they are.
     offsets, std = np.array(aligned.attrs["time_offset"]), aligned.attrs.get("time_offset_std")
     if np.abs(offsets).max() < _DELAY * np.median(np.diff(capture["time"].values)):
         return unchanged

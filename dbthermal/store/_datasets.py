@@ -252,7 +252,7 @@ def _open(checked: integrity.CheckedStore, leave: Iterable[str] = ()) -> xr.Data
     try:
         dataset: xr.Dataset = xr.open_zarr(checked, drop_variables=list(leave), **options)
     except KeyError as error:  # of arrays without names of their dims
-        rule = "Must be of dbthermal; readers.array and 'dbthermal import' read others"
+        rule = "Must name the dims of its arrays; readers.array and 'dbthermal import' read others"
         raise ValueError(f"Invalid store '{checked.root}'. {rule}.") from error
     return dataset
 

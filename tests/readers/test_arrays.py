@@ -534,8 +534,10 @@ def test_times_are_as_many_as_frames(tmp_path: Path) -> None:
     )
     limits = hdf5(tmp_path / "a.h5", _valid_range=[1, 2, 3])
     assert_refused("^Refused 'a.h5': .* 'valid_range', a list. Must be two values", read, limits)
-    with pytest.raises(TypeError, match="Invalid valid_range of 'a"):
+    with pytest.raises(TypeError, match="or valid_min and valid_max, of"):
         read(hdf5(tmp_path / "a.h5", _valid_min="zero"))
+    with pytest.warns(UserWarning, match="^Unknown origin 'lab 3'"):
+        assert read(hdf5(tmp_path / "a.h5", _origin="lab 3")).origin == "measured"
 
 
 def netcdf(path: Path, version: int, *, records: bool, time: bool = False) -> Path:

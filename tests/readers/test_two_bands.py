@@ -154,9 +154,9 @@ test_arguments_that_make_no_capture = refused(
         ("offset", np.nan, r"Invalid offset \[s\] nan\. Must lie in"),
         ("offset", "0", r"Invalid offset \[s\] '0'\. Must be a number"),
         ("offset", True, r"Invalid offset \[s\] True\. Must be a number"),
-        ("bands", "ab", "Invalid bands 'ab'. Must be 2 different names"),
-        ("bands", ("a", "a"), r"Invalid bands \('a', 'a'\). Must be 2 different names"),
-        ("bands", ("a", "b "), "Must be 2 different names, trimmed"),
+        ("bands", "ab", "Invalid bands 'ab'. Must be 2 different trimmed texts"),
+        ("bands", ("a", "a"), r"Invalid bands \('a', 'a'\). Must be 2 different trimmed texts"),
+        ("bands", ("a", "b "), "Must be 2 different trimmed texts"),
         *(
             ("bands", one, "Invalid bands")
             for one in ((8.0, 9.5), ("a", "b", "c"), ("a", " "), None)

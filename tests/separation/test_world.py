@@ -60,6 +60,7 @@ WORLDS: dict[str, tuple[World, str, str]] = {
     ),
     "registered by 0.3 pixel": (World(off=0.3, detail=DETAIL), "off that of", "fine detail"),
     "never registered": (World(off=2.0, detail=DETAIL), "off that of", "fine detail"),
+    "never registered, far": (World(off=4.0, detail=DETAIL), "off that of", "fine detail"),
     "never registered, in hand": (
         World(off=1.0, shake=(0.3, 0.3), detail=DETAIL),
         "off that of",

@@ -112,7 +112,7 @@ def test_opening_reads_no_values(capture: xr.Dataset, tmp_path: Path) -> None:
         store.open_dataset(tmp_path / "b.zarr")
     zarr.open_group(tmp_path / "c.zarr", mode="w").create_array("a", shape=(2, 3), dtype="u2")
     with pytest.warns(UserWarning, match="No checksums"):
-        assert_refused("c.zarr'. Must be of dbthermal", store.open_dataset, tmp_path / "c.zarr")
+        assert_refused("c.zarr'. Must name the dims", store.open_dataset, tmp_path / "c.zarr")
 
 
 def test_figures(tmp_path: Path) -> None:

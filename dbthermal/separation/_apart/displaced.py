@@ -29,7 +29,7 @@ from dbthermal.separation._quality import Bits
 _ROUNDS: Final = 100
 _SOLVED: Final = 1e-3
 _UNSOLVED: Final = 1e-2
-# A place so far outside of the image is told by its border: a known shift may be off so [pixel].
+# A place so far outside of the image is told by its border: a shift may be off by it [pixel].
 _OUTSIDE: Final = 0.2
 _LOST_WEIGHT: Final = 0.25  # weight of pixels without a value that good pixels may take over [1]
 # Share of the pixels of some rows up to which pixels are read singly: a shift that is as wide as
@@ -272,12 +272,12 @@ def read(
 
 def _used(weights: csr_array, rows: slice) -> tuple[Any, dict[str, Any]]:
     """Pixels of some rows that have a weight, if few; and the places of the pixels to read."""
-    columns, pixels = np.unique(weights.indices), weights.shape[1]
-    if columns.size > _SHARE * pixels:
+    sources, pixels = np.unique(weights.indices), weights.shape[1]
+    if sources.size > _SHARE * pixels:
         return slice(None), {"y": rows}
-    y, x = np.divmod(columns, pixels // (rows.stop - rows.start))
+    y, x = np.divmod(sources, pixels // (rows.stop - rows.start))
     places = {"y": y + rows.start, "x": x}
-    return columns, {name: xr.DataArray(index, dims="pixel") for name, index in places.items()}
+    return sources, {name: xr.DataArray(index, dims="pixel") for name, index in places.items()}
 
 
 def without(weights: csr_array, bad: Mask, width: int) -> csr_array:

@@ -78,7 +78,7 @@ class Scatters(tiles.Pixels):
         white = self.freedom[:, np.newaxis, np.newaxis] * np.eye(len(self.noise))
         matrices = np.moveaxis(self.scatter, -1, 0) + white
         # As where the second camera sees another material at p than the first at r. There the
-        # method has the pixel's ratios, too (`pixel.ratios`), and pairs of p get the object.
+        # method has the pixel's ratios, too (`pixel.ratios`), and pixels paired with p its object.
         conflict = self.usable & ~reflection_ratio.agrees(matrices, material.ratio / self.noise)
         ratio = self.ratio
         inverse = reflection_ratio.inverse_energy(self.scatter, ratio, self.noise, self.freedom)

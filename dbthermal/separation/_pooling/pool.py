@@ -164,16 +164,16 @@ def estimate(
         # The principal axis of the added scatters is the maximum of the likelihood, without the
         # bias of a mean of ratios. The emissivity is the mean of the pixels' emissivities,
         # corrected to these ratios.
-        ratio_set, inlier, removable = _sound(labels, count, survey, noise)
+        ratio_set, group, removable = _sound(labels, count, survey, noise)
         if material is None:
-            common, inlier = _common(image, labels, (ratio_set, inlier, removable), survey, noise)
+            common, group = _common(image, labels, (ratio_set, group, removable), survey, noise)
         else:
             # Ratios of a stated material are kept; NaN of a material without information.
             stated = np.isfinite(material.ratio[-1])
             ratio = np.where(stated, material.ratio, image.expand(ratio_set.ratio))
             variance = np.where(stated, material.inverse_energy, image.expand(ratio_set.variance))
             common = Material.of_ratios(ratio, variance, material.spread)
-        return _material(image, common, inlier, survey)
+        return _material(image, common, group, survey)
 
 
 def _usual(labels: Labels, count: int, survey: Survey) -> Survey:
@@ -196,14 +196,14 @@ def _sound(labels: Labels, count: int, survey: Survey, noise: Array) -> tuple[Ra
     surveyed = np.where(survey.frames[0] > 0, 1.0, 0.0)
     mostly_measured = total(labels, measured, count) > _MAJORITY * total(labels, surveyed, count)
     removable = np.append(mostly_measured, False)[labels]
-    inlier = np.where(outliers & removable, -1, labels)
+    group = np.where(outliers & removable, -1, labels)
     for _ in range(_ROUNDS):
-        ratio_set = _ratios(inlier, count, survey, noise, even=True)
-        outliers = _outliers(inlier, ratio_set, ratio_set.common(labels), survey, noise)
+        ratio_set = _ratios(group, count, survey, noise, even=True)
+        outliers = _outliers(group, ratio_set, ratio_set.common(labels), survey, noise)
         if not np.any(outliers):
             break
-        inlier = np.where(outliers, -1, inlier)
-    return _ratios(inlier, count, survey, noise), inlier, removable
+        group = np.where(outliers, -1, group)
+    return _ratios(group, count, survey, noise), group, removable
 
 
 def _ratios(
@@ -346,24 +346,24 @@ def _common(
     image: Image, labels: Labels, sound: tuple[Ratios, Labels, Mask], survey: Survey, noise: Array
 ) -> tuple[Material, Labels]:
     """Ratios of all pixels with their gradients, and labels of the pixels that agree with them."""
-    pooled, inlier, removable = sound
+    pooled, group, removable = sound
     # Few pixels with an emissivity alone, a selection by their ratios, tell no gradient.
-    subset = np.where(removable, inlier, -1)
+    subset = np.where(removable, group, -1)
     common, uneven = _with_gradients(image, subset, pooled, survey, noise)
     if not np.any(uneven):
-        return common, inlier
+        return common, group
     # Along a gradient pixels far from its middle are no outliers, and the scatters, which are
     # added, have one axis only without the gradient.
     for _ in range(_GRADED):
         local = common.select_pixels(image.surveyed)
-        inlier = np.where(uneven[labels], labels, inlier)
-        inlier = np.where(removable & _outliers(inlier, pooled, local, survey, noise), -1, inlier)
+        group = np.where(uneven[labels], labels, group)
+        group = np.where(removable & _outliers(group, pooled, local, survey, noise), -1, group)
         change = pooled.ratio[:, labels] / local.ratio
         factor = np.where(np.isfinite(change), change, 1.0)
         even = replace(survey, scatter=survey.scatter * factor[:, np.newaxis] * factor)
-        pooled = _ratios(inlier, uneven.size - 1, even, noise)
-        common, _ = _with_gradients(image, np.where(removable, inlier, -1), pooled, survey, noise)
-    return common, inlier
+        pooled = _ratios(group, uneven.size - 1, even, noise)
+        common, _ = _with_gradients(image, np.where(removable, group, -1), pooled, survey, noise)
+    return common, group
 
 
 def _material(image: Image, common: Material, labels: Labels, survey: Survey) -> Material:

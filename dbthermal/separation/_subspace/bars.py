@@ -136,14 +136,14 @@ def _propagate(model: Model, record: Any, epsilon: float, work: Work) -> bool:
             sensitivity[t] += factor * emitted[t]
     # What the criterion for the order leaves of the object's curve is as large as the noise that
     # one more function would have cost, log N times. The residual of a frame of rest holds both.
-    resting, margin, leverage = 0.0, 1.0 + log(frames) / count, model.leverage[record.order - 1]
+    resting, factor, leverage = 0.0, 1.0 + log(frames) / count, model.leverage[record.order - 1]
     widening = 1.0 / (1.0 - NORMAL95**2 * epsilon) ** 2
     for t in range(frames):
         flat = 1.0 / work.steepness[t]
         sensitivity[t] *= flat
         smooth_variance[t] = leverage[t] * null * flat**2
         square = sensitivity[t] ** 2 * epsilon
-        expected = noise**2 + first**2 * (square + smooth_variance[t] * margin)
+        expected = noise**2 + first**2 * (square + smooth_variance[t] * factor)
         resting += 1.0 if work.residual[t] ** 2 < WITHIN**2 * expected else 0.0
         work.variance[t] = square * widening + smooth_variance[t]
     return resting < RESTING * frames
