@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from dbthermal.separation._subspace.method import SubspaceSettings
 
 _UNEXPLAINED: Final = (
-    "In {:.0%} of what mirrors motion the bands do not show the same at the same time, and no "
+    "The bands do not show the same at the same time in {:.0%} of what mirrors motion, and no "
     "shift of the reflections explains it. If an object is heated in steps, or rows or columns "
     "share noise, the intervals held in simulations; if the cameras stand apart and a pixel "
     "mirrors several depths, or their clocks differ, those of pixels without a flag are too small."

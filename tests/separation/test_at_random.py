@@ -51,7 +51,7 @@ def at_random(seed: int) -> tuple[xr.Dataset, xr.Dataset]:
 
 
 @pytest.mark.long
-@pytest.mark.filterwarnings("ignore:In .* of what mirrors motion the bands do not show the same")
+@pytest.mark.filterwarnings("ignore:The bands do not show the same at the same time")
 def test_hardly_a_pixel_is_wrong_without_a_flag() -> None:
     """Of eight scenes: pixels beyond five deviations, and the intervals of all, in each way."""
     counted = dict.fromkeys(("without a flag", "completed"), np.zeros(3))
