@@ -130,7 +130,7 @@ def fill_times(stamps: Array) -> Array:
     ----------
     stamps : Array
         Times (time) [s], NaN where a frame is missing; before the first and after the last by a
-        frame period each. TypeError or ValueError if there are fewer than two, or they fall.
+        frame period each. TypeError or ValueError for fewer than two, or if they do not rise.
     """
     stamps = _numbers.real_numbers("exposure times [s]", stamps)
     label = "exposure times of the camera"

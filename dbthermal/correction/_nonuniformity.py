@@ -180,7 +180,7 @@ def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
     image of unknown temperature says nothing of it (`undo_drift` does). `offset_std` becomes that
     of an image as noisy as one of the calibration's. The attribute ``offset_renewed`` is 1.
 
-    TypeError or ValueError if bands or pixels differ, or a good pixel is infinite or its gain is 0.
+    TypeError or ValueError if bands or pixels differ, or a good pixel lacks numbers or gain > 0.
 
     Parameters
     ----------

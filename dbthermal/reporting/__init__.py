@@ -117,9 +117,8 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
     view = View(data, capture, response)
     if "object_temperature" not in view.panes:
         raise ValueError("Missing variable 'object_temperature'. Must be a result of separation.")
-    result = view.data
+    result, chosen = view.data, _chosen(view, regions)
     shot = result if view.capture is None else view.capture
-    chosen = _chosen(view, regions)
     shown = [name for name in view.panes if name in FILMS or name.startswith("emissivity ")]
     curves = {
         name: {pane: view.curve(pane, region, pixels="measured") for pane in shown}

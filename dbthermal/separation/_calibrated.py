@@ -59,12 +59,12 @@ def separate(tile: Tile, settings: CalibratedSettings) -> Estimate:
         shared = np.pad(covariance, ((0, 1), (0, 1), (0, 0)))  # the level is of no weight
         solution = frames.solve(tile, e, level, np.full_like(level, _PRIOR_VARIANCE), shared)
         solved = np.isfinite(solution.signal)
-        signal, left = solution.signal, solution.white
+        signal, var = solution.signal, solution.white
         if settings.smooth and len(signal) > 1:
-            signal, left = windows.smooth(signal, left, solved, tile.time)
-        left = left + solution.shared
+            signal, var = windows.smooth(signal, var, solved, tile.time)
+        var = var + solution.shared
         values = list[Array]()
-        for mean, variance in ((signal, left), (solution.background, solution.background_variance)):
+        for mean, variance in ((signal, var), (solution.background, solution.background_variance)):
             values += frames.temperatures(tile, np.where(solved, mean, np.nan), variance)
         gray = _gray(e, covariance)
     # Flag gray pixels, and those without a solution.

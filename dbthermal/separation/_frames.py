@@ -48,7 +48,7 @@ def newton(polynomial: tuple[float, ...], target: float, x: float) -> tuple[floa
 @kernels.compiled
 def bridge(values: Array, variance: Array, time: Array) -> int:
     """Fill the NaN of a curve by lines, its ends by the nearest frame; return their number."""
-    last, rate, missing, left = -1, 0.0, 0, -1
+    last, rate, missing, start = -1, 0.0, 0, -1
     for t in range(time.size):
         if np.isnan(values[t]):
             missing += 1
@@ -58,11 +58,11 @@ def bridge(values: Array, variance: Array, time: Array) -> int:
         last = t
     # The variance grows as that of a random walk of the curve's own steps.
     rate /= max(time.size - missing - 1, 1)
-    for right in range(time.size + 1 if last >= 0 else 0):
-        if right < time.size and np.isnan(values[right]):
+    for stop in range(time.size + 1 if last >= 0 else 0):
+        if stop < time.size and np.isnan(values[stop]):
             continue
-        before, after = right if left < 0 else left, left if right == time.size else right
-        for t in range(left + 1, right):
+        before, after = stop if start < 0 else start, start if stop == time.size else stop
+        for t in range(start + 1, stop):
             share, walk = 0.0, abs(time[t] - time[before])
             if before != after:
                 share = walk / (time[after] - time[before])
@@ -70,7 +70,7 @@ def bridge(values: Array, variance: Array, time: Array) -> int:
             values[t] = values[before] + share * (values[after] - values[before])
             variance[t] = variance[before] + share * (variance[after] - variance[before])
             variance[t] += rate * walk
-        left = right
+        start = stop
     return missing
 
 
