@@ -38,6 +38,8 @@ _COVARIANCE: Final = "emissivity_covariance"
 # Share of pixels in pieces from which these are kept for the next pass: 0.08 where a band is two
 # frames late, 0.19 of a rapid object before displaced cameras (outcomes of tests/separation) [1].
 _DIVIDED: Final = 0.125
+# Films that are not needed of each pixel alone when pixels are pooled.
+_OVERWRITTEN: Final = "object_temperature", "background_temperature", "background_temperature_std"
 _ASSUMED: Final = {"calibration", "blackbody", "gain_offset_by_camera"}
 METHODS: Final = tuple(_MODULES)
 """Names of the methods; the module of each is imported when it is first used."""
@@ -184,7 +186,11 @@ def separated(
     workers: int = 2,
     progress: bool = False,
 ) -> tuple[xr.Dataset, Survey | None]:
-    """Separate checked inputs; return result, and surveys per pixel of cameras at one place."""
+    """Separate checked inputs; return result, and surveys per pixel of cameras at one place.
+
+    Pooled films of cameras at one place are written over those of each pixel `alone`, but for the
+    object's deviation.
+    """
     # Make the result, whose values are written tile by tile.
     capture, names = inputs.capture, [*schema.STAGES["separated"]]
     displaced, pooled = inputs.displacement is not None, inputs.labels is not None
@@ -192,7 +198,10 @@ def separated(
     if alone is None and displaced and pooled:
         alone, _ = separated(replace(inputs, labels=None), workers=workers, progress=progress)
     names += [_COVARIANCE, "drift_std"] if inputs.method.pools else []
-    result = separated_dataset(capture, dict.fromkeys(names))
+    arrays: dict[str, Any] = dict.fromkeys(names)
+    if alone is not None and not displaced:
+        arrays |= {name: alone[name].values for name in _OVERWRITTEN}
+    result = separated_dataset(capture, arrays)
     # Separate; for displaced cameras and materials, the number of passes is not known beforehand.
     total = None if displaced or pooled else result["status"].size
     with (
@@ -224,7 +233,7 @@ def separated(
         else:
             surveys = separate_pixels(inputs, None)
     if inputs.method.pools:
-        _withhold(result)
+        _withhold(result, result["status"].values >= 0)
     # Say what was used: noise, method, settings, warnings.
     metadata = inputs.response.attrs | capture.attrs
     notes = [np.atleast_1d(data.attrs.get("warnings", [])) for data in (inputs.response, capture)]
@@ -248,12 +257,23 @@ def separated(
     return result, surveys
 
 
-def _withhold(result: xr.Dataset) -> None:
+def separate_again(inputs: Inputs, result: xr.Dataset, selection: Mask, workers: int) -> None:
+    """Separate selected pixels (y, x), of cameras at one place, each by itself, into a result."""
+    chosen = selection.ravel()
+    inputs.division[:, chosen] = 0
+    survey, films = Survey.empty(len(inputs.bands), chosen.size), result.drop_vars("noise")
+    with ThreadPoolExecutor(workers) as threads:
+        list(threads.map(partial(_separate, inputs, None, films, survey, chosen), inputs.blocks))
+    _withhold(result, selection)
+
+
+def _withhold(result: xr.Dataset, selection: Mask) -> None:
     """Withhold objects whose emissivity lies outside (0, 1): rapid changes were no reflection's."""
-    impossible = (result["status"].values & np.uint32(schema.Status.NONPHYSICAL_EMISSIVITY)) != 0
+    flags = result["status"].values & np.uint32(schema.Status.NONPHYSICAL_EMISSIVITY)
+    impossible = np.flatnonzero(selection & (flags != 0))
     for name in ("object_temperature", "object_temperature_std"):
         for frame in result[name].values:
-            frame[impossible] = np.nan
+            frame.ravel()[impossible] = np.nan
         release()
 
 
@@ -352,39 +372,38 @@ def _write(
     cut: tiles.Cut,
     estimates: list[tuple[Mask, Mask, Estimate]],
 ) -> None:
-    """Write the estimates of a window into the result, at frames (time) and pixels (pixel)."""
+    """Write the estimates of a cut into the result, at frames (time) and pixels (pixel)."""
     # The tile's bands have the places `bands` in the capture.
     order, shape = np.argsort(bands), tuple(span.stop - span.start for span in cut.window)
+    row, column = np.divmod(cut.places, result.sizes["x"])
     whole = any(np.all(frames) and np.all(pixels) for frames, pixels, _ in estimates)
-    invalid = ~cut.valid.reshape(-1, *shape)
     for name in map(str, result.data_vars):
-        target, dims = result.variables[name].values[..., *cut.window], result.variables[name].dims
-        # What has no estimate becomes NaN.
-        if name == "status":
-            target[...] = cut.status.reshape(shape)
-        elif not whole:
-            target[...] = np.nan
-        for frames, pixels, estimate in estimates:
-            values, places = getattr(estimate, name), pixels.reshape(shape)
-            if values is None:
-                target[..., places] = np.nan
-            elif name == "status":
-                target[places] |= values
-            elif "time" not in dims:
-                target[..., places] = values[np.ix_(*[order] * (values.ndim - 1))]
-            elif whole:
-                target[...] = values.reshape(target.shape)
-            else:
-                row, column = np.array(np.nonzero(places), np.uintp)
-                _place(target, np.flatnonzero(frames), row, column, values)
-        if "time" in dims and invalid.any():
-            target[invalid] = np.nan
+        array, is_film = result.variables[name].values, "time" in result.variables[name].dims
+        if is_film and whole:
+            values = getattr(estimates[0][2], name)
+        else:  # what has no estimate is NaN
+            blank = cut.status if name == "status" else np.nan
+            values = np.full((*array.shape[:-2], row.size), blank, array.dtype)
+            for frames, pixels, estimate in estimates:
+                part = getattr(estimate, name)
+                if name == "status":
+                    values[pixels] |= part
+                elif is_film:
+                    _place(values, np.flatnonzero(frames), np.flatnonzero(pixels), part)
+                elif part is not None:
+                    values[..., pixels] = part[np.ix_(*[order] * (part.ndim - 1))]
+        if is_film and not cut.valid.all():
+            values = np.where(cut.valid, values, np.nan)
+        if row.size == np.prod(shape):
+            array[..., *cut.window] = values.reshape(*array.shape[:-2], *shape)
+        else:
+            array[..., row, column] = values
 
 
 @compiled
-def _place(film: Array, frames: Whole, row: Whole, column: Whole, values: Array) -> None:
-    """Write values (frame, pixel) at some frames, rows and columns of a film, in place."""
+def _place(film: Array, frames: Whole, pixels: Whole, values: Array) -> None:
+    """Write values (frame, pixel) at some frames and pixels of a film, in place."""
     for frame in range(frames.size):
         image = film[frames[frame]]
-        for pixel in range(row.size):
-            image[row[pixel], column[pixel]] = values[frame, pixel]
+        for pixel in range(pixels.size):
+            image[np.uintp(pixels[pixel])] = values[frame, pixel]
