@@ -100,10 +100,8 @@ def align(
     >>> import numpy as np, xarray as xr
     >>> rng, time = np.random.default_rng(1), np.arange(40) / 10.0
     >>> counts = rng.normal(20000, 5, (2, 40, 4, 4)).astype(np.float32)
-    >>> corrected = xr.Dataset(
-    ...     {"counts": (("band", "time", "y", "x"), counts)},
-    ...     {"band": ["8-14", "9.5"], "time": time},
-    ... )
+    >>> axes = {"band": ["8-14", "9.5"], "time": time}
+    >>> corrected = xr.Dataset({"counts": (("band", "time", "y", "x"), counts)}, axes)
     >>> aligned = align(corrected, offset=-0.1, clock="8-14")
     >>> bool((aligned.counts[1, :-1] == counts[1, 1:]).all()), aligned.frames_lost
     (True, [0, 1])

@@ -102,10 +102,9 @@ def time_offset(corrected: xr.Dataset, *, band: str | None = None, search: int =
     >>> steps = rng.normal(0, 20, (802, 64)) * (rng.random((802, 64)) < 0.05)
     >>> signal = np.cumsum(steps, axis=0)
     >>> counts = np.stack([signal[:800:4], signal[2:802:4]]).reshape(2, 200, 8, 8)
-    >>> corrected = xr.Dataset(
-    ...     {"counts": (("band", "time", "y", "x"), counts + rng.normal(0, 1, counts.shape))},
-    ...     {"band": ["8-14", "9.5"], "time": time},
-    ... )
+    >>> counts += rng.normal(0, 1, counts.shape)
+    >>> axes = {"band": ["8-14", "9.5"], "time": time}
+    >>> corrected = xr.Dataset({"counts": (("band", "time", "y", "x"), counts)}, axes)
     >>> round(time_offset(corrected), 2)  # the frame period is 0.1 s
     0.05
     """

@@ -216,8 +216,9 @@ def _frames(counts: xr.DataArray) -> npt.NDArray[np.intp]:
 def displaced_windows(corrected: xr.Dataset, scale: Scale) -> tuple[bool, float]:
     r"""Tell whether the cameras may see reflections displaced, and in which share of windows.
 
-    A Gauss-Newton step from no displacement [1] matches the windows, of changes that no smooth
-    object shows; and once more of those too rapid for an object that heats within seconds:
+    A Gauss-Newton step from no displacement (Lucas, Kanade 1981, An iterative image registration
+    technique, IJCAI) matches the windows, of changes that no smooth object shows; and once more of
+    those too rapid for an object that heats within seconds:
 
     .. math:: z_2 = \kappa_w \, (z_1 + d \cdot \nabla z_1)
 
@@ -227,10 +228,6 @@ def displaced_windows(corrected: xr.Dataset, scale: Scale) -> tuple[bool, float]
 
     The step is blind beyond the size of the texture: changes may be displaced, too, if those of the
     first band explain too little of those of the second band at the same pixels.
-
-    References
-    ----------
-    .. [1] Lucas, Kanade (1981), An iterative image registration technique, IJCAI
     """
     if min(corrected.sizes.get(name, 0) for name in ("y", "x")) < SMALLEST:
         return False, 0.0

@@ -91,10 +91,8 @@ def register(
     >>> from scipy.ndimage import gaussian_filter
     >>> scene = gaussian_filter(np.random.default_rng(1).normal(20000, 3000, (70, 70)), 4)
     >>> views = np.stack([[scene[3:67, 3:67]] * 2, [scene[1:65, :64]] * 2])  # [count]
-    >>> corrected = xr.Dataset(
-    ...     {"counts": (("band", "time", "y", "x"), views)},
-    ...     {"band": ["8-14", "9.5"], "time": [0.0, 0.1]},
-    ... )
+    >>> axes = {"band": ["8-14", "9.5"], "time": [0.0, 0.1]}
+    >>> corrected = xr.Dataset({"counts": (("band", "time", "y", "x"), views)}, axes)
     >>> transform = register(corrected, model="translation")
     >>> transform.sel(band="9.5").values[:2, 2].round(1).tolist()  # [pixel]
     [3.0, 2.0]

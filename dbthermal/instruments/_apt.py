@@ -9,8 +9,6 @@ A controller that is addressed wrongly says nothing: its address is searched for
 sequence numbers, and a controller reports the end of a move at any time: the next message is not
 always the reply. So messages are identified by identifier, source and channel.
 
-References
-----------
 Facts alone were taken, no code: yaq-project/thorlabs-apt-protocol 29.0.0, moonshot-nagayama-pj/PnPQ
 (messages), Thorlabs/Motion_Control_Examples (commit bbdeca5, start of the line), pylablib 1.4.5
 (scale of the FW103 wheel), thorlabs_apt_device 0.3.8 (addresses of racks).

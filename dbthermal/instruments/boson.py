@@ -7,8 +7,6 @@ A busy camera answers late; without sequence numbers every later command then ge
 command before (openmv/openmv, pull request 3265). Here each request has a new number. Connecting
 sends and resets nothing, and nothing is ever written to the camera's flash memory.
 
-References
-----------
 Facts alone, none of the vendor's text or code: openmv/openmv, ``drivers/boson`` (commit cbbb877,
 identifiers, enumerations, status codes); FLIR/rawBoson, ``rawBoson.c`` (commit 0f192d6); frames in
 thurberdog/ghostCommand (commit 35dc641) and in LJMUAstroecology/flirpy issue 21.

@@ -10,11 +10,9 @@ setting is read back. A motion is over when the controller reports its end or th
 clear, and the wheel is where it should be. Neither is enough alone: bits were seen to stick, the
 report of an earlier move may come late, and before a move starts the bits are clear too.
 
-References
-----------
-pylablib 1.4.5, ``Thorlabs/kinesis.py`` (scales and units of speed); instrumentkit,
-``thorlabsapt.py`` (25600 counts for an FW103); thorlabs_apt_device 0.3.8, ``bsc.py`` (the same
-units, and addresses). Facts alone, no code.
+Facts alone, no code, were taken from pylablib 1.4.5, ``Thorlabs/kinesis.py`` (scales and units of
+speed), instrumentkit, ``thorlabsapt.py`` (25600 counts for an FW103), and thorlabs_apt_device
+0.3.8, ``bsc.py`` (the same units, and addresses).
 """
 
 from collections.abc import Callable, Mapping

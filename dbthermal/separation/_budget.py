@@ -1,4 +1,4 @@
-r"""Budget of a result by cause [1]_, with what its calibration is taken for.
+r"""Budget of a result by cause, with what its calibration is taken for.
 
 The bands show noise, and how certain the ratios are. A background that drifts along with the object
 they do not show: it is a prior's (`SubspaceSettings.background_drift`), and moves the emissivities
@@ -16,12 +16,8 @@ that are found with them,
     \delta e_b = e_b (1 - e_b) (\beta - \alpha)
 
 An error of the blackbody is one of all temperatures; what it mirrors is one of all gains; coloured
-reflections are errors of the ratios.
-
-References
-----------
-.. [1] JCGM 100:2008, Guide to the expression of uncertainty in measurement,
-   doi:10.59161/JCGM100-2008E
+reflections are errors of the ratios. Causes are combined as by JCGM 100:2008, Guide to the
+expression of uncertainty in measurement, doi:10.59161/JCGM100-2008E.
 """
 
 from typing import Any, Final

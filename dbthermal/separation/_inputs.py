@@ -252,9 +252,9 @@ def decide_noise(
     # With a stated noise: that, unless the capture proves more.
     if "noise" in response:
         stated_noise = np.asarray(responses.noise(response, names) / slopes)
-        if decided == "capture":
+        if decided:
             return response, np.asarray(stated_noise * factor)
-        pixels = 0 if decided else min(_NOISE_PIXELS, _NOISE_SAMPLES // capture.sizes["time"])
+        pixels = min(_NOISE_PIXELS, _NOISE_SAMPLES // capture.sizes["time"])
         counts = samples.some_pixels(capture["counts"], max(samples.PIXELS, pixels))
         # Counts rounded to steps wider than the noise were rounded after that was measured, or by
         # others: an error of its own, uniform in a step.
@@ -262,13 +262,15 @@ def decide_noise(
         wide = np.sqrt(12.0) * rounding > stated_noise
         stated = np.asarray(np.hypot(stated_noise, np.where(wide, rounding, 0.0)) * factor)
         valid = schema.measured(counts)
-        if not decided and not (valid.all(axis=0).any() and capture.get("mask", valid).any()):
+        if not (valid.all(axis=0).any() and capture.get("mask", valid).any()):
             label = f"Invalid samples in all of {counts.shape[2]} pixels, evenly spaced"
             rule = "Must be numbers in all bands, not masked; else flagged invalid_samples"
             response = warned(response, f"{label}. {rule}.")
         signals = np.where(valid, counts, np.nan) / slopes[:, None, None]
-        larger = np.nan * stated if decided else samples.larger_noise(signals, stated)
+        larger = samples.larger_noise(signals, stated)
         if np.isnan(larger).all():
+            rounded = "band", stated / factor * slopes, schema.NOISE.attrs
+            response = response.sel(band=names).assign(noise=rounded) if wide.any() else response
             return response.assign_attrs(noise_source="response"), stated
         noise = np.where(np.isnan(larger), stated, larger)
         text = " and ".join(

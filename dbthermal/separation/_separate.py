@@ -31,7 +31,7 @@ from dbthermal.separation._misfit import Misfit
 from dbthermal.separation._motion import drift, stabilise
 from dbthermal.separation._overlay import overlay
 from dbthermal.separation._pooling import materials as pooling
-from dbthermal.separation._pooling.pool import copy_pixels, hold, sampled_objects
+from dbthermal.separation._pooling.pool import hold
 from dbthermal.separation._quality import MOST_BRIDGED
 from dbthermal.separation._solve import get_method, require_whole, separate_again, separated
 from dbthermal.separation._tiles import Material
@@ -316,16 +316,15 @@ def _separated(
     unexplained = share > (0.0 if reflection_shift is None else _SHIFT_SHARE)
     doubts = [_UNEXPLAINED.format(share)] if unexplained else []
     # Pool the pixels of each material, and hold them to what each tells by itself.
-    result, objects = per_pixel, sampled_objects(per_pixel)
+    result = per_pixel
     pool = partial(separated, alone=per_pixel, surveys=surveys, workers=workers, progress=progress)
     if materials is not None:
         result, _ = pool(replace(inputs, labels=numbered(corrected, materials)))
     elif find_spec("skimage") is not None:
         result, materials = _over_found_materials(pool, inputs, corrected, per_pixel)
     if materials is not None:
-        restore = partial(separate_again, inputs, result, workers=workers)
-        restore = restore if reflection_shift is None else partial(copy_pixels, per_pixel, result)
-        hold(per_pixel, result, materials, objects, restore, apart=reflection_shift is not None)
+        restore = partial(separate_again, inputs, result, workers)
+        hold(per_pixel, result, materials, restore if reflection_shift is None else None)
     return Measured(result, inputs, materials, reflection_shift, doubts)
 
 

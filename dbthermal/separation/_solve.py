@@ -38,8 +38,8 @@ _COVARIANCE: Final = "emissivity_covariance"
 # Share of pixels in pieces from which these are kept for the next pass: 0.08 where a band is two
 # frames late, 0.19 of a rapid object before displaced cameras (outcomes of tests/separation) [1].
 _DIVIDED: Final = 0.125
-# Films that are not needed of each pixel alone when pixels are pooled.
-_OVERWRITTEN: Final = "object_temperature", "background_temperature", "background_temperature_std"
+# Films of each pixel alone that pooled ones are written over, of cameras at one place.
+_OVERWRITTEN: Final = "background_temperature", "background_temperature_std"
 _ASSUMED: Final = {"calibration", "blackbody", "gain_offset_by_camera"}
 METHODS: Final = tuple(_MODULES)
 """Names of the methods; the module of each is imported when it is first used."""
@@ -186,11 +186,7 @@ def separated(
     workers: int = 2,
     progress: bool = False,
 ) -> tuple[xr.Dataset, Survey | None]:
-    """Separate checked inputs; return result, and surveys per pixel of cameras at one place.
-
-    Pooled films of cameras at one place are written over those of each pixel `alone`, but for the
-    object's deviation.
-    """
+    """Separate checked inputs; return result, and surveys per pixel of cameras at one place."""
     # Make the result, whose values are written tile by tile.
     capture, names = inputs.capture, [*schema.STAGES["separated"]]
     displaced, pooled = inputs.displacement is not None, inputs.labels is not None
@@ -233,7 +229,7 @@ def separated(
         else:
             surveys = separate_pixels(inputs, None)
     if inputs.method.pools:
-        _withhold(result, result["status"].values >= 0)
+        _withhold(result)
     # Say what was used: noise, method, settings, warnings.
     metadata = inputs.response.attrs | capture.attrs
     notes = [np.atleast_1d(data.attrs.get("warnings", [])) for data in (inputs.response, capture)]
@@ -257,23 +253,23 @@ def separated(
     return result, surveys
 
 
-def separate_again(inputs: Inputs, result: xr.Dataset, selection: Mask, workers: int) -> None:
+def separate_again(inputs: Inputs, result: xr.Dataset, workers: int, selection: Mask) -> None:
     """Separate selected pixels (y, x), of cameras at one place, each by itself, into a result."""
     chosen = selection.ravel()
     inputs.division[:, chosen] = 0
     survey, films = Survey.empty(len(inputs.bands), chosen.size), result.drop_vars("noise")
     with ThreadPoolExecutor(workers) as threads:
         list(threads.map(partial(_separate, inputs, None, films, survey, chosen), inputs.blocks))
-    _withhold(result, selection)
+    _withhold(result)
 
 
-def _withhold(result: xr.Dataset, selection: Mask) -> None:
+def _withhold(result: xr.Dataset) -> None:
     """Withhold objects whose emissivity lies outside (0, 1): rapid changes were no reflection's."""
     flags = result["status"].values & np.uint32(schema.Status.NONPHYSICAL_EMISSIVITY)
-    impossible = np.flatnonzero(selection & (flags != 0))
+    impossible = np.flatnonzero(flags)
     for name in ("object_temperature", "object_temperature_std"):
         for frame in result[name].values:
-            frame.ravel()[impossible] = np.nan
+            frame.flat[impossible] = np.nan
         release()
 
 

@@ -1,10 +1,8 @@
 """Curves smoothed over the widest window that agrees with all narrower ones, compiled.
 
-Local parabolas, of which the confidence intervals are intersected [1]_: what is smooth is averaged
-over many frames, what is rapid over few.
-
-.. [1] Goldenshluger, Nemirovski (1997), On spatially adaptive estimation of nonparametric
-   regression, Mathematical Methods of Statistics 6, 135
+Local parabolas, of which the confidence intervals are intersected (Goldenshluger, Nemirovski 1997,
+On spatially adaptive estimation of nonparametric regression, Mathematical Methods of Statistics 6,
+135): what is smooth is averaged over many frames, what is rapid over few.
 """
 
 from math import sqrt

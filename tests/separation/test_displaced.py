@@ -11,7 +11,7 @@ from scenes import GLASS, RIG, field, held, judged, painted
 from scipy.sparse import csr_array
 from worlds import MARGIN, RESPONSE, SHAPE, World, seen
 
-from dbthermal import alignment, separation, simulation
+from dbthermal import alignment, response, separation, simulation
 from dbthermal.schema import Status
 from dbthermal.separation._apart import equations
 from dbthermal.separation._apart.equations import Equations
@@ -158,6 +158,17 @@ def test_the_quietest_camera_stays_the_reference() -> None:
     assert result.attrs["reference_band"] == "8-14"
     found = alignment.reflection_shift(smooth, response)
     assert found.attrs["reference_band"] == "8-14"
+
+
+def test_a_camera_whose_counts_are_rounded_is_the_noisier() -> None:
+    """Steps of 1.5 K make the quietest camera the noisiest, in all parts of a separation."""
+    shift = smooth_shift((32, 48), 3.0, 0.0)
+    capture = painted(1, picture=replace(SMALL, shape=(32, 48)), time=TIME, shift=shift).capture
+    step = 1.5 * response.curves(RIG.response(), ["8-14"])[0].reference_slope
+    capture["counts"][0] = step * np.rint(capture["counts"][0] / step)
+    result = separation.separate(capture, RIG.response())
+    assert result.attrs["reflection_shift"] == "found"
+    assert result.attrs["reference_band"] == "9.5"
 
 
 def test_materials_too_narrow_for_a_blur_are_pooled_all_the_same() -> None:

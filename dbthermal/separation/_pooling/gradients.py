@@ -5,14 +5,11 @@ material q is a polynomial of the place, :math:`q = \sum_k c_k f_k(x, y)`:
 
 .. math:: c = A^{-1} \sum b f, \quad A = \sum a f f^T, \quad C = A^{-1} (\sum v f f^T) A^{-1}
 
-It is a constant unless the Bayesian information criterion [1]_ says otherwise, and then of the
-degree that predicts best [2]_. What pixels, and squares of some, scatter about it beyond v is their
-spread: one that undulates is seen in sums over neighbours long before it is in single pixels.
-
-References
-----------
-.. [1] Schwarz (1978), Annals of Statistics 6, 461, doi:10.1214/aos/1176344136
-.. [2] Akaike (1974), IEEE Transactions on Automatic Control 19, 716, doi:10.1109/TAC.1974.1100705
+It is a constant unless the Bayesian information criterion says otherwise (Schwarz 1978, Annals of
+Statistics 6, 461, doi:10.1214/aos/1176344136), and then of the degree that predicts best (Akaike
+1974, IEEE Transactions on Automatic Control 19, 716, doi:10.1109/TAC.1974.1100705). What pixels,
+and squares of some, scatter about it beyond v is their spread: one that undulates is seen in sums
+over neighbours long before it is in single pixels.
 """
 
 from dataclasses import dataclass, replace

@@ -28,6 +28,8 @@ Surveyor: TypeAlias = Callable[[Inputs, Material | None, Mask], Survey]
 Regroup: TypeAlias = Callable[[Material | None], Labels]
 """New labels (pixel) of materials, from the estimates of the materials before."""
 
+Restore: TypeAlias = Callable[[Mask], None]  # separates selected pixels (y, x) alone again
+
 # Share of a material's pixels with an emissivity alone, from which they tell it for all [1].
 _COVERAGE: Final = 0.98
 _ROUNDS: Final = 6  # rounds of leaving out pixels that are not of the material
@@ -435,25 +437,11 @@ def regrouped(
     return inputs, materials(inputs)
 
 
-def sampled_objects(result: xr.Dataset) -> Array:
-    """Copy the object temperature (frame, y, x) [K] in some frames, evenly spaced."""
-    film = result["object_temperature"].values
-    return film[:: max(1, len(film) // _FRAMES)].copy()
-
-
 def hold(
-    per_pixel: xr.Dataset,
-    pooled: xr.Dataset,
-    labels: xr.DataArray,
-    objects: Array,
-    restore: Callable[[Mask], None],
-    *,
-    apart: bool = True,
+    per_pixel: xr.Dataset, pooled: xr.Dataset, labels: xr.DataArray, restore: Restore | None
 ) -> None:
-    """Restore pixels that pooling contradicts to what each tells alone, or widen deviations.
-
-    Of each pixel alone the maps, the object's deviation, and the `objects` in some frames are used.
-    """
+    """Restore pixels, or widen their deviations, where pooled values contradict the pixel alone."""
+    apart = restore is None  # of displaced cameras all films of each pixel alone are kept: copied
     # A pixel alone has the ratio of its own changes, with errors of the cameras' pairing or of
     # mixing at an edge; at its material's ratio these errors are in the object.
     sound, valid = (result["status"].values == 0 for result in (per_pixel, pooled))
@@ -471,12 +459,12 @@ def hold(
     # At one place nothing is added if most moving pixels of the material are gray alone.
     if not apart:
         common &= _share(np.where(still, -1, labels.values), gray_alone) <= _GRAY_SHARE
+    films = [result["object_temperature"].values for result in (pooled, per_pixel)]
     # Mean square D of the objects' difference, in deviations of the pixel alone.
     square, variance = np.zeros((2, *common.shape))
-    step = slice(None, None, max(1, len(stds) // _FRAMES))
-    films = pooled["object_temperature"].values[step], objects, stds[step]
+    sampled = slice(None, None, max(1, len(stds) // _FRAMES))
     for row, columns in enumerate(map(np.flatnonzero, sound & valid)):
-        samples = (film[:, row].take(columns, axis=1) for film in films)
+        samples = (film[sampled, row].take(columns, axis=1) for film in (*films, stds))
         value, base, std = (sample.astype(np.float64) for sample in samples)
         square[row, columns] = np.nanmean(((value - base) / std) ** 2, axis=0)
         variance[row, columns] = np.nanmean(std**2, axis=0)
@@ -492,7 +480,8 @@ def hold(
     mean = neighbour_mean(square * variance, common | (stay & sound), _VICINITY)
     constant = np.where(valid & ~sound, np.nan_to_num(mean), 0.0)
     factor, film = square * common, pooled["object_temperature_std"].values
-    if stay.any():
+    maps = [(pooled[n].values, a.values) for n, a in per_pixel.items() if apart and "x" in a.dims]
+    if restore is not None and stay.any():
         restore(stay)
     wider = (factor > 0) | (constant > 0)
     for row in map(int, np.flatnonzero((wider | stay).any(axis=1))):
@@ -500,17 +489,9 @@ def hold(
         base, std = (array[:, row].take(columns, axis=1) for array in (stds, film))
         added = factor[row, columns] * np.nan_to_num(base) ** 2 + constant[row, columns]
         film[:, row, columns] = np.sqrt(std**2 + added)
+        for target, variable in maps:
+            target[..., row, places] = variable[..., row, places]
         film[:, row, places] *= np.sqrt(1.0 + excess[row, places])
-        release()
-
-
-def copy_pixels(source: xr.Dataset, result: xr.Dataset, selection: Mask) -> None:
-    """Copy selected pixels (y, x) of all films and maps into a result."""
-    maps = [(result[it].values, data.values) for it, data in source.items() if "x" in data.dims]
-    for row in map(int, np.flatnonzero(selection.any(axis=1))):
-        columns = np.flatnonzero(selection[row])
-        for target, values in maps:
-            target[..., row, columns] = values[..., row, columns]
         release()
 
 
