@@ -81,8 +81,8 @@ def tiff(
         Unit of the pixels. Temperatures, also as whole numbers (temperature-linear data), are
         refused: the camera made them with an emissivity, and mixtures add up in counts only.
     clock : float or array_like, optional
-        Frame rate [Hz] or time of each frame [s]. At a rate, files with a frame each whose numbers,
-        or dates, leave some out have gaps in time there.
+        Frame rate [Hz], or time [s] or date of each frame. At a rate, files with a frame each whose
+        numbers, or dates, leave some out have gaps in time there.
     rows : slice, optional
         Rows of the image to keep; no others take memory.
     memory : float

@@ -103,7 +103,7 @@ def test_nothing_is_saved_inside_a_store(capture: xr.Dataset, tmp_path: Path) ->
 
 
 def test_degrees_celsius_are_not_saved_as_kelvin(capture: xr.Dataset, tmp_path: Path) -> None:
-    """Nor opened by a command; under their own unit, or with a row of NaN, they are saved."""
+    """Under their own unit, or as NaN alone, temperatures are saved."""
     celsius = capture.assign(object_temperature=(film := capture["object_temperature"]) - 273.15)
     for units in ({}, {"units": "K"}):
         celsius["object_temperature"].attrs = units
