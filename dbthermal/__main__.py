@@ -250,7 +250,7 @@ def _parser() -> argparse.ArgumentParser:
         about["epilog"] = "\n".join(["examples:", *examples])
         command = commands.add_parser(name, **about, **plain)
         command.set_defaults(place=place)
-        command._negative_number_matcher = re.compile(r"-[\d.]+[CK]?$")  # no option: -5C
+        command._negative_number_matcher = re.compile(r"-[\d.]+(e[-+]?\d+)?[CK]?$")  # -5C
         writes = ["--overwrite"] if "--output" in arguments else []
         for argument in (*arguments, *writes, "--dry-run", "--json", "--traceback"):
             short = ["-o"] if argument == "--output" else []

@@ -56,8 +56,7 @@ def quotient(numerator: Any, denominator: Any, otherwise: float) -> Any:
 
 def select(values: Any, selected: Any, axis: int = -1) -> Any:
     """Values at the selected indices or mask along an axis, in the same order of axes in memory."""
-    selected = np.flatnonzero(selected) if selected.dtype == bool else selected
-    return values.take(selected, axis=axis)
+    return values.take(np.flatnonzero(selected) if selected.dtype == bool else selected, axis=axis)
 
 
 @contextmanager
@@ -143,8 +142,7 @@ class _Rows(BackendArray):
                     values = values[(slice(None),) * axis + (_even(index),)]
                 result[..., _even(wanted), :] = values
                 release()
-        whole = (slice(None) if place.ndim else 0 for place in places)
-        return np.asarray(result[tuple(whole)])
+        return np.asarray(result[tuple(slice(None) if place.ndim else 0 for place in places)])
 
 
 def _even(places: Values) -> Any:

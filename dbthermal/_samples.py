@@ -58,16 +58,14 @@ def noise(signal: npt.NDArray[Any]) -> Array:
     valid = np.isfinite(signal)
     frames = valid.sum(axis=0)
     if not valid.all():  # invalid samples of each pixel go behind the valid ones
-        order = np.argsort(~valid, axis=0, kind="stable")
-        signal = np.take_along_axis(signal, order, axis=0)
+        signal = np.take_along_axis(signal, np.argsort(~valid, axis=0, kind="stable"), axis=0)
     differences = np.abs(signal[1:-1] - 0.5 * (signal[:-2] + signal[2:]))
     differences.sort(axis=0)  # NaN last
     # The smaller four fifths of the changes are free of the object and of passing reflections.
     quiet = np.maximum((_QUIET * (frames - 2)).astype(np.intp), 1)
     mask = np.arange(len(differences)).reshape(-1, *(1,) * quiet.ndim) < quiet
     total = differences.sum(axis=0, dtype=np.float64, where=mask)
-    level = total / quiet / (_QUIET_MEAN * np.sqrt(1.5))
-    return np.where(frames < MINIMUM_FRAMES, np.nan, level)
+    return np.where(frames < MINIMUM_FRAMES, np.nan, total / quiet / (_QUIET_MEAN * np.sqrt(1.5)))
 
 
 def larger_noise(signals: npt.NDArray[Any], stated: Array) -> Array:
@@ -242,8 +240,7 @@ def end_of(
         end = counts.max(axis=0, where=valid, initial=counts.min(initial=0))
     else:
         end = counts.min(axis=0, where=valid, initial=counts.max(initial=0))
-    at_end = counts == end if used is True else (counts == end) & valid
-    return end, counted(at_end)
+    return end, counted(counts == end if used is True else (counts == end) & valid)
 
 
 def counted(mask: Mask) -> npt.NDArray[np.intp]:

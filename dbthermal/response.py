@@ -107,16 +107,13 @@ class Curve:
         scale = self._scale(temperature)
         exponent = planck.SECOND_RADIATION_CONSTANT / scale
         excess = np.expm1(exponent)
-        growth = self.amplitude / excess * (1.0 + 1.0 / excess)
-        return growth * exponent * self.wavelength / scale
+        return self.amplitude / excess * (1.0 + 1.0 / excess) * exponent * self.wavelength / scale
 
     def inverse(self, counts: npt.ArrayLike) -> Array:
         """Temperature [K] of a blackbody of given counts; NaN at and below the offset."""
         excess = np.asarray(counts, dtype=np.float64) - self.offset
-        invertible = (excess > 0) & np.isfinite(excess)
-        ratio = self.amplitude / np.where(invertible, excess, np.nan)
-        scale = planck.SECOND_RADIATION_CONSTANT / np.log1p(ratio)
-        return (scale - self.shift) / self.wavelength
+        ratio = self.amplitude / np.where((excess > 0) & np.isfinite(excess), excess, np.nan)
+        return (planck.SECOND_RADIATION_CONSTANT / np.log1p(ratio) - self.shift) / self.wavelength
 
     @cached_property
     def reference_counts(self) -> float:

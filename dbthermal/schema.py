@@ -275,8 +275,7 @@ class Flags(IntFlag):
     def __new__(cls, value: int, meaning: str = "") -> Self:
         """Bit of a value and a sentence."""
         member = int.__new__(cls, value)
-        member._value_ = value
-        member.meaning = meaning
+        member._value_, member.meaning = value, meaning
         return member
 
     @property
@@ -372,8 +371,9 @@ def measured(values: npt.NDArray[Any] | xr.DataArray) -> Any:
 def require_measured(values: npt.NDArray[Any], label: str) -> None:
     """Refuse samples that are no numbers, see `measured`."""
     if not np.all(measured(values)):
-        message = f"Invalid {label}: NaN or infinite, or beyond {LARGEST:g}"
-        raise ValueError(f"{message}. Must be finite.")
+        raise ValueError(
+            f"Invalid {label}: NaN or infinite, or beyond {LARGEST:g}. Must be finite."
+        )
 
 
 def check(
@@ -460,6 +460,16 @@ def check_variable(array: xr.DataArray, variable: Variable, label: str) -> None:
             require_rising(values, name, units)
 
 
+def check_kelvin(result: xr.Dataset) -> xr.Dataset:
+    """Refuse a film of degrees Celsius, by a row of its first frame: of a store a single chunk."""
+    film = result.get("object_temperature", xr.DataArray(0.0))
+    kind = (film.dims, str(film.attrs.get("units", "K")), film.dtype.kind, film.size > 0)
+    is_read = film.chunks is None and kind == (("time", "y", "x"), "K", "f", True)
+    if is_read and (level := float(film[0, film.sizes["y"] // 2].median())) < _numbers.KELVIN[0]:
+        raise ValueError(f"Invalid object temperature {level:.1f}. Must be in kelvin, not Celsius.")
+    return result
+
+
 def check_numbers(array: xr.DataArray, label: str, units: str | None = None) -> xr.DataArray:
     """Check that an array holds real numbers, of a unit if it states one, and return it."""
     require(array, xr.DataArray, label)
@@ -536,14 +546,12 @@ def pixel_status(capture: xr.Dataset) -> npt.NDArray[np.uint32]:
 
 def segments(capture: xr.Dataset) -> npt.NDArray[np.intp]:
     """Number of shutter events before each frame (time), 0 without a variable `segment`."""
-    without = np.zeros(capture.sizes["time"])
-    return np.asarray(capture.get("segment", without), dtype=np.intp)
+    return np.asarray(capture.get("segment", np.zeros(capture.sizes["time"])), dtype=np.intp)
 
 
 def noise_factor(capture: xr.Dataset) -> npt.NDArray[np.float64]:
     """Noise (band) [1] over that before an alignment, 1 without a variable `noise_factor`."""
-    whole = np.ones(capture.sizes["band"])
-    return np.asarray(capture.get("noise_factor", whole), dtype=np.float64)
+    return np.asarray(capture.get("noise_factor", np.ones(capture.sizes["band"])), dtype=np.float64)
 
 
 def laid_on(

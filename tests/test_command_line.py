@@ -647,7 +647,13 @@ separate scene.zarr response.zarr --corrected-by-camera --register none --offset
 separate scene.zarr response.zarr --correction nuc.zarr --corrected-by-camera -o x.zarr
  -> Invalid correction of gain and offset: both
 {EXCHANGED} -> Warning: Counts of bands .* are files of the bands exchanged
-calibrate --at 5C --clock 10 -o x.zarr -> Invalid 0 files
+calibrate --at 5C --clock 10 -o x.zarr -> Blackbody at 5C: Invalid 0 files
+calibrate --at 5C a5.tif --clock 10 -o x.zarr -> Blackbody at 5C: Invalid 1 files .'a5.tif'.
+export scene.zarr -o x.tif -> .object_temperature. for .tif. 'scene.zarr' has no result. Must be
+separate aligned.zarr response.zarr --method calibrated -o x.zarr -> Missing --emissivity for method
+info a.tif --clock times.csv -> argument --clock: Invalid number 'times.csv'.* go to clock= in Pyth
+{ONE} --offset -3e+3 -o x.zarr -> Invalid offset -3000 s: the recordings of .* do not overlap
+info folder/* --clock 10 -> No file or folder 'folder/.'
 calibrate --blackbody response.zarr -o x.zarr --correction-output y.zarr
  -> Unused option --correction-output. Must be left out: 'response.zarr' has no pixels
 info a*.tif --clock 10 -> Warning: 'a.tif to a70.tif' have .200, 16, 16, 16, 16. frames. Must be
@@ -737,6 +743,7 @@ def mistaken(results: Path) -> Path:
             tifffile.imwrite(results / name, stack[place], photometric="minisblack")
     (results / "noise.tif").write_bytes(bytes(range(50)))
     (results / "folder").mkdir()
+    (results / "folder" / ".hidden").write_bytes(bytes(range(50)))  # which a shell does not expand
     (results / "dangling").symlink_to("nowhere")
     (results / "link.zarr").symlink_to("nowhere.zarr")
     np.savez(results / "two.npz", a=stack, b=stack + np.uint16(1))

@@ -127,6 +127,7 @@ def test_status_attributes_follow_cf() -> None:
 def test_status_of_16_bits_still_opens(tmp_path: Path) -> None:
     """A result stored with a 16-bit status passes its stage, and its bits mean the same."""
     older = example("separated")
+    older["object_temperature"].values[:] = 300.0  # [K]
     bits = np.array([[0, 1024], [1 << 15, 128 | 4]], dtype=np.uint16)
     first = {name: bit for name, bit in Status.bits().items() if bit < 1 << 16}
     meanings = " ".join(first)

@@ -35,8 +35,8 @@ def expanded(values: list[Any]) -> list[Any]:
     result = list[Any]()
     for value in values:
         is_pattern = isinstance(value, Path) and not value.exists()
-        root = Path(value.anchor if is_pattern else "")
-        files = list(root.glob(str(value.relative_to(root))) if is_pattern else ())
+        names = Path(value.anchor).glob(str(value.relative_to(value.anchor))) if is_pattern else ()
+        files = [it for it in names if it.name[0] != "." or value.name[0] == "."]  # as a shell
         files.sort(key=lambda file: ([*map(int, re.findall("[0-9]+", str(file)))], file))
         result += files or [expanded(value) if isinstance(value, list) else value]
     return result
@@ -63,7 +63,9 @@ def finite(text: str) -> float:
     """Finite number of a text."""
     form = r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d\d?)?"
     if not re.fullmatch(form, text, re.IGNORECASE) or math.isinf(float(text)):
-        raise ArgumentTypeError(f"Invalid number '{text}'. Must be digits, with a decimal point.")
+        rule = "Must be digits, with a decimal point"
+        rule += "; times in a file go to clock= in Python" * text.endswith((".csv", ".txt", ".npy"))
+        raise ArgumentTypeError(f"Invalid number '{text}'. {rule}.")
     return float(text)
 
 

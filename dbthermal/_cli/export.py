@@ -26,24 +26,23 @@ def export(options: argparse.Namespace) -> dict[str, Any]:
     options.variable, *further = options.variable or ["object_temperature"]
     if suffix not in _WRITERS:
         raise ValueError(f"Invalid output '{options.output}'. Must end in one of {[*_WRITERS]}.")
-    if suffix != ".nc":  # pictures, or curves over time
+    if suffix != ".nc":  # pictures, or curves over time, of which bridged frames have none
         dims, last = (("y", "x"), 2) if suffix in (".tif", *PICTURES) else (("time", "y", "x"), 4)
-        missing = {*str(result.attrs.get("not_estimated", "")).split()}
-        missing |= {"bridged"} if last > len(dims) else set()  # no curve, nor a film to see
+        missing = {*str(result.attrs.get("not_estimated", "")).split(), "bridged" * (last == 4)}
         fitting = {str(name) for name in result if result[name].dims[-last:] == dims}
         if not (names := sorted(fitting - missing)):
             rule = "Must be a result, as from: dbthermal separate; *.nc takes any store"
             raise ValueError(f"No variable with times and pixels in '{options.result}'. {rule}.")
         if further or options.variable not in names:
-            kind = f"variable '{' '.join([options.variable, *further])}' for {suffix}"
-            raise ValueError(f"Unknown {kind}. Must be one of {names}.")
+            kind = f"Unknown variable '{' '.join([options.variable, *further])}' for {suffix}"
+            state = "" if FILMS.keys() & {*result} else f" '{options.result}' has no result."
+            raise ValueError(f"{kind}.{state} Must be one of {names}.")
     # A film or picture has that of the status beside it.
     outputs = {options.output: options.variable}
     if suffix in (".tif", *PICTURES) and "status" in result and options.variable != "status":
         outputs[options.output.with_stem(f"{options.output.stem}_status")] = "status"
-    for path in outputs:
-        if path.exists() and not options.overwrite:
-            raise FileExistsError(f"There is something at '{path}'. Must be new, or --overwrite.")
+    for path in (it for it in outputs if it.exists() and not options.overwrite):
+        raise FileExistsError(f"There is something at '{path}'. Must be new, or --overwrite.")
     summary = {}
     for path, options.variable in outputs.items():
         with store.whole(path, suffix) as draft:

@@ -48,7 +48,7 @@ _NOT_RECORDED: Final = {"dry_run", "json", "overwrite", "place", "traceback"}
 
 def opened(path: Path) -> xr.Dataset:
     """Dataset of a store, or stage `capture` of a recording."""
-    dataset = store.open_dataset(path)
+    dataset = schema.check_kelvin(store.open_dataset(path))
     if "log_time" not in dataset:  # what is made of a recording has its attributes, and no log
         return dataset
     from dbthermal.instruments import recording  # noqa: PLC0415 - optional
@@ -139,8 +139,7 @@ def _arguments(
     for name, values in {"clock": options.clock, "name": options.variable}.items():
         if values and name in parameters:
             stated[name] = values[min(camera, len(values) - 1)]
-    if "shape" in stated:
-        stated["shape"] = tuple(options.shape)
+    stated |= {"shape": tuple(options.shape)} if "shape" in stated else {}
     for name, parameter in parameters.items():
         required = parameter.kind is Parameter.KEYWORD_ONLY and parameter.default is Parameter.empty
         if required and name not in stated:
@@ -285,9 +284,8 @@ def refuse_unused(options: Namespace, arguments: Sequence[str]) -> None:
     """Refuse an option that is stated and has no effect."""
     stated = {argument.partition("=")[0] for argument in arguments}
     for reason, names in _unused(options).items():
-        for flag in (f"--{name.replace('_', '-')}" for name in names.split()):
-            if flag in stated:
-                raise ValueError(f"Unused option {flag}. Must be left out {reason}.")
+        for flag in sorted(stated & {f"--{name.replace('_', '-')}" for name in names.split()}):
+            raise ValueError(f"Unused option {flag}. Must be left out {reason}.")
 
 
 def _unused(options: Namespace) -> dict[str, str]:

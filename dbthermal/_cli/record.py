@@ -79,10 +79,9 @@ def _run(session: Session, folder: Path, *, dry: bool) -> int:
 def _progress(watch: Watch, preview: Preview) -> None:
     """Print the progress of a recording in a line that is written over the line before."""
     watch.note(preview)
-    bands = "; ".join(
-        f"{band}: " + ", ".join([*status.text.splitlines(), *status.warning.splitlines()])
-        for band, status in watch.status().items()
-    )
+    states = watch.status().items()
+    rows = {name: [*it.text.splitlines(), *it.warning.splitlines()] for name, it in states}
+    bands = "; ".join(f"{band}: {', '.join(row)}" for band, row in rows.items())
     _say(f"\r{preview.time:6.1f} s  {bands}", end="")
 
 

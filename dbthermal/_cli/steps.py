@@ -153,8 +153,10 @@ def _blackbody(options: Namespace) -> xr.Dataset:
     for temperature, *paths in options.at:
         if isinstance(temperature, Path):
             raise ValueError(f"Invalid --at {temperature}. Must begin with a temperature: 20C.")
-        offset = [0.0] * (len(options.bands or "ab") - 1)  # nothing moves: any will do
-        still = files.capture(paths, options, offset)
+        try:  # nothing moves: any offset will do
+            still = files.capture(paths, options, [0.0] * (len(options.bands or "ab") - 1))
+        except ValueError as error:  # which names files; of one temperature there may be none
+            raise ValueError(f"Blackbody at {temperature - zero_Celsius:g}C: {error}") from error
         stamps = still.get("exposure_time", still["time"].expand_dims("band"))
         good = np.flatnonzero(stamps.notnull().all("band"))  # padded and damaged frames have none
         files.check_all(good[frames].size, options, "frames", f"the blackbody at {temperature:g} K")

@@ -43,7 +43,8 @@ def answer(result: xr.Dataset, materials: xr.Dataset | None = None) -> tuple[lis
         deviations = _deviations(section, valid)
         numbers |= {"object_temperature_degC": [low, high], "object_temperature_std_K": deviations}
         bars = " and ".join(f"+- {value:.2g} K ({cause})" for cause, value in deviations.items())
-        name = "Object" if measured.any() else "Object, completed and not measured,"
+        state = "completed and not measured" if completed.any() else "flagged and not measured"
+        name = "Object" if measured.any() else f"Object, {state},"
         typical = f"typically {bars}" if bars else "without a standard deviation"
         span = f"from {low:.1f} to {high:.1f} degC ({np.ptp(_RANGE):g} % of the values)"
         sentences.append(f"{name} {span}, {typical}.")
@@ -54,7 +55,8 @@ def answer(result: xr.Dataset, materials: xr.Dataset | None = None) -> tuple[lis
         sentences.append(f"{level}; a calibration is wrong if that is far off.")
     # Shares of the pixels.
     remainder = f"completed, not measured: {completed.mean():.0%}"
-    sentences.append(f"Measured: {measured.mean():.0%} of the pixels; {remainder}.")
+    black = ", as of a black body" * (result.attrs.get("method") == "apparent")
+    sentences.append(f"Measured{black}: {measured.mean():.0%} of the pixels; {remainder}.")
     # Materials, and what to watch out for.
     numbers["materials"] = listed = by_material(result, measured, table)
     for entry in listed:

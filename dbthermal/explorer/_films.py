@@ -111,8 +111,7 @@ def result_panes(data: xr.Dataset) -> Iterator[Pane]:
     for name in (name for name in variables if name in data):
         schema.check_variable(data[name], variables[name], f"'{name}' of the result")
         schema.laid_on(data[name], film, f"'{name}'", "the object temperature")
-    if film.variable._in_memory and (first := float(film[0].median())) < _numbers.KELVIN[0]:
-        raise ValueError(f"Invalid object temperature {first:.1f}. Must be in kelvin, not Celsius.")
+    schema.check_kelvin(data)
     # What is estimated, then its deviations: a film each, or a map a band.
     missing = str(data.attrs.get("not_estimated", "")).split()
     stds = [f"{name}_std" for name in (*FILMS, "emissivity") if name not in missing]

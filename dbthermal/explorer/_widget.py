@@ -164,8 +164,7 @@ class Explorer(anywidget.AnyWidget):
         number = int(np.ceil(np.abs(stop - start).max())) + 1
         places = np.linspace(start, stop, number).astype(int)
         rows, columns = np.clip(places, 0, np.array(self.view.shape) - 1).T
-        frame = self._frame(request["pane"], request)
-        return {}, [frame[rows, columns].astype(np.float32)]
+        return {}, [self._frame(request["pane"], request)[rows, columns].astype(np.float32)]
 
     def _answer_probe(self, request: dict[str, Any]) -> tuple[dict[str, Any], list[Any]]:
         """Answer values and flags of a pixel."""

@@ -14,7 +14,6 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import replace
-from datetime import UTC, datetime
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
@@ -30,6 +29,9 @@ from dbthermal.readers._recording import MEMORY, Clock
 
 # Names of times, perhaps with their unit, of an array beside another, or a dim.
 _TIMES: Final = re.compile("((frame_?)?time(s|_?stamps?)?|t)(_(s|ms|us|ns))?", re.IGNORECASE)
+# Further names, of an array with a value for each frame; durations and shutters' are no times.
+_LIKE_TIMES: Final = "(?!.*(exposure|integration|zone|ffc|nuc)).*(time|zeit|clock|stamp|seconds|"
+_ANY_TIMES: Final = re.compile(f"{_TIMES.pattern}|{_LIKE_TIMES}elapsed).*", re.IGNORECASE)
 # Names of dims by their place, and dims of an array without names, in any case of letters.
 _DIMS: Final = (f"{_TIMES.pattern}|frames?|images?", "y|rows?|height", "x|col(umn)?s?|width")
 _WITHOUT_NAME: Final = r"||None|(phony_)?dim_\d+"
@@ -39,7 +41,6 @@ _ATTRIBUTES: Final = (
     *("units", "unit", *_NEUTRAL, "_FillValue", "missing_value", "origin", "_Unsigned"),
     *("long_name", "standard_name", "valid_min", "valid_max", "valid_range"),
 )
-_MOMENT: Final = 40  # longest text of a moment [character]
 _OBJECTS, _DEPTH = 4096, 32  # of a file of HDF5; one with more takes minutes to list
 _LONGEST: Final = 2**10  # of a time [byte]; longer text, as a table in each place, is none
 _CHECKSUMS: Final = ("fletcher32", "crc32", "crc32c", "adler32")
@@ -106,16 +107,18 @@ def array(
             values, lines = _opened(path, name, stack)
         else:
             coords = source.coords.values() if isinstance(source, xr.DataArray) else ()
-            lines = dict([(c.name, c) for c in coords if _are_times(c.name, c)][:1])
+            lines = dict([(c.name, c) for c in coords if _are_times(c.name, c, _TIMES)][:1])
         attributes = _checked(values, label, unit)
         _recording.check_memory(getattr(values, "shape", ()), memory, label, stored)
         rates, sentences = _rates(values, lines, path), list[str]()
         for line in lines.items():
             if (seconds := _seconds(line, values.shape[0], clock, label, path)) is None:
-                rule = "Must be numbers or ISO 8601; clock= is not compared with them"
-                sentences.append(f"Times '{line[0]}' of '{label}' are another text. {rule}.")
+                number, frames = line[1].size, values.shape[0]
+                form = "another text" if number == frames else f"{number} for {frames} frames"
+                rule = "Must be numbers or ISO 8601, one a frame; clock= is not compared with them"
+                sentences.append(f"Times '{line[0]}' of '{label}' are {form}. {rule}.")
             clock = seconds if clock is None else clock
-        stamps = _recording.stamps(clock, values.shape[0], label)
+        stamps = _recording.stamps(clock, values.shape[0], label, *sentences)
         read = _read(values, path) if is_file else _recording.film(values)
     counts = read.view(np.uint16)
     # The numbers: byte order, and values that stand for missing counts.
@@ -167,13 +170,9 @@ def _checked(values: Any, label: str, unit: str) -> dict[str, Any]:
 
 
 def _seconds(line: Any, frames: int, clock: Clock | None, label: str, path: Path) -> Clock | None:
-    """Seconds by named times, which the clock must not contradict; None for a text."""
+    """Seconds by named times, which the clock must not contradict; None of a text, or too few."""
     name, times = line
-    if times.size != frames:
-        rule = f"Must be {frames}, one for each frame"
-        raise ValueError(f"Invalid number {times.size} of times of '{label}'. {rule}.")
-    _check_whole(times, path)
-    if (moments := _moments(times)) is None:
+    if times.size != frames or (moments := _moments(times, path)) is None:
         return None
     unit = "s" if times.dtype.kind in "OSUM" else _attribute(times, "units")
     unit = unit or (re.search("_(s|ms|us|ns)$", str(name).lower()) or ("", ""))[1]  # by its name
@@ -182,10 +181,7 @@ def _seconds(line: Any, frames: int, clock: Clock | None, label: str, path: Path
 
 def _rates(values: Any, lines: dict[str, Any], path: Path) -> list[Any]:
     """Frame rates by attributes of an array and its file, or by numbers, taken out of its times."""
-    rates = list[Any]()
-    for number in [lines.pop(key) for key in [*lines] if key.lower() in _RATES]:
-        _check_whole(number, path)
-        rates.append(_moments(number))
+    rates = [_moments(lines.pop(key), path) for key in [*lines] if key.lower() in _RATES]
     for holder in (values, getattr(values, "parent", None), getattr(values, "file", None)):
         with suppress(ValueError):  # of a list
             rates += [_attribute(holder, key) for key in _RATES]
@@ -203,11 +199,11 @@ def _dims_of(values: Any) -> list[Any]:
     return [dim.label or (dim[0].name.rpartition("/")[2] if len(dim) else "") for dim in dims]
 
 
-def _are_times(name: object, values: Any) -> bool:
+def _are_times(name: object, values: Any, names: re.Pattern[str] = _ANY_TIMES) -> bool:
     """Tell whether an array is a coordinate of times, by its name."""
     is_line = 0 < values.ndim < 3 and values.size == max(values.shape)  # MATLAB has no vectors
     is_line = is_line and values.dtype.itemsize <= _LONGEST
-    return is_line and bool(_TIMES.fullmatch(str(name).rpartition("/")[2]))
+    return is_line and bool(names.fullmatch(str(name).rpartition("/")[2]))
 
 
 def _attribute(values: Any, name: str) -> Any:
@@ -226,20 +222,15 @@ def _attribute(values: Any, name: str) -> Any:
     return value.decode() if isinstance(value, bytes) else value
 
 
-def _moments(times: Any) -> npt.NDArray[Any] | None:
+def _moments(times: Any, path: Path) -> npt.NDArray[Any] | None:
     """Times as numbers or dates, dates in text as seconds; None for other text."""
+    _check_whole(times, path)
     if times.dtype.kind in "iufmM" and isinstance(times.dtype, np.dtype):  # of pandas, with a zone
         return np.asarray(times[...]).reshape(-1)
-    seconds = list[float]()
-    for number in range(times.size) if times.dtype.kind in "OSUM" and times.ndim == 1 else ():
-        text = times[number]  # of any length: in memory one by one
-        text = text.decode(errors="replace") if isinstance(text, bytes) else str(np.asarray(text))
-        try:
-            moment = datetime.fromisoformat(text if len(text) <= _MOMENT else "")
-        except ValueError:
-            return None
-        seconds.append(moment.replace(tzinfo=moment.tzinfo or UTC).timestamp())
-    return np.array(seconds) if seconds else None
+    with suppress(ValueError):  # of other text; in memory one by one, for it may be long
+        if times.dtype.kind in "OSUM" and times.ndim == 1:
+            return _recording.dates(times[number] for number in range(times.size))
+    return None
 
 
 def _times_of(arrays: dict[str, Any], name: str, path: Path) -> dict[str, Any]:
@@ -253,17 +244,15 @@ def _times_of(arrays: dict[str, Any], name: str, path: Path) -> dict[str, Any]:
     films = [key for key, array in arrays.items() if array.ndim == 3 and key != name]
     groups = ["", *(name[: n + 1] for n, letter in enumerate(name) if letter == "/")]
     around = next((it for it in groups if not any(key.startswith(it) for key in films)), name)
-    named = {
-        key: array
-        for (place, key), array in lines.items()
-        if _TIMES.fullmatch(key) and (place == group or f"{place}/".startswith(around))
-    }
-    for key, number in ((key, times.size) for key, times in named.items()):
-        if number != frames and number in image:
-            label = f"'{name}' of '{path.name}', {frames} frames of {image}: '{key}' has {number}"
-            rule = "Must be (time, y, x), in MATLAB (y, x, time): transpose it, or rename the times"
-            raise ValueError(f"Invalid axes of {label}. {rule}.")
-    return {key: times for key, times in named.items() if times.size == frames}
+    near = {n: it for (place, n), it in lines.items() if f"{place}/".startswith(around)}
+    near |= {key: array for (place, key), array in lines.items() if place == group}
+    fitting = {n: it for n, it in near.items() if it.size == frames and it.dtype.kind not in "bV"}
+    named = {n: it for n, it in near.items() if _TIMES.fullmatch(n) and it.size > 1}
+    for key in (key for key, times in named.items() if times.size in {*image} - {frames}):
+        label = f"'{name}' of '{path.name}', {frames} frames of {image}"
+        rule = "Must be (time, y, x), in MATLAB (y, x, time): transpose it, or rename the times"
+        raise ValueError(f"Invalid axes of {label}: '{key}' has {named[key].size}. {rule}.")
+    return ({key: fitting[key] for key in fitting if key in named} or fitting) | named
 
 
 def _opened(path: Path, name: str | None, stack: ExitStack) -> tuple[Any, dict[str, Any]]:
@@ -280,8 +269,7 @@ def _opened(path: Path, name: str | None, stack: ExitStack) -> tuple[Any, dict[s
     names = {key: key.rpartition("/")[2] for key, array in arrays.items() if array.size == 1}
     rates = {name: arrays[key] for key, name in names.items() if name.lower() in _RATES}
     arrays = {n: array for n, array in arrays.items() if array.ndim == 3 or _are_times(n, array)}
-    films = [key for key in arrays if arrays[key].ndim == 3]
-    name = _recording.array_name(films, name, path, shapes)
+    name = _recording.array_name([n for n in arrays if arrays[n].ndim == 3], name, path, shapes)
     return arrays[name], _times_of(arrays, name, path) | rates
 
 
@@ -378,8 +366,7 @@ def _check_pieces(array: Any, path: Path) -> None:
         is_whole = length == size + before + after
         if packer < len(codes) and not mask:
             _, packed = array.id.read_direct_chunk(place)
-            unpacks = _UNPACKED[_PACKERS[codes[packer]]]
-            is_whole = unpacks(packed[: length - after], size + before)
+            is_whole = _UNPACKED[_PACKERS[codes[packer]]](packed[: length - after], size + before)
         if not is_whole:
             raise ValueError(f"Invalid chunk of '{name}' at {place}. Must unpack to {size}.")
 
@@ -393,9 +380,7 @@ def _foreign_store(path: Path, _: ExitStack) -> dict[str, Any]:
         if isinstance(root, zarr.Group):
             members = dict(root.members(max_depth=None))
     arrays = {n: array for n, array in members.items() if isinstance(array, zarr.Array)}
-    for name, array in arrays.items():
-        if not (array.ndim == 3 or _are_times(name, array)):
-            continue
+    for name, array in ((n, a) for n, a in arrays.items() if a.ndim == 3 or _are_times(n, a)):
         for code in array.filters:
             kind = getattr(code, "codec_id", type(code).__name__)
             if not re.fullmatch(_LOSSLESS, kind, re.IGNORECASE):
@@ -418,8 +403,7 @@ def _check_chunks(values: zarr.Array[Any], path: Path) -> None:
     whole = tuple(number * piece for number, piece in zip(grid, pieces, strict=True))
     # Files of chunks, which must be of their stated size.
     keys = [file for file in (path / values.path).rglob("*") if re.fullmatch(_CHUNK, file.name)]
-    keys = [key for key in keys if key.is_file()]
-    _check_unpacked(values, keys, path)
+    _check_unpacked(values, keys := [key for key in keys if key.is_file()], path)
     # A missing chunk of a shard reads as the fill value: with another fill value it differs.
     if values.shards:
         fill = values.dtype.type(values.fill_value == 0)

@@ -192,7 +192,7 @@ def flir(
     # Byte order, flags and times.
     order, by = _order(counts, form, byte_order, name)
     flags = np.where(same_number, 0, FileFlag.NUMBERS_DIFFER.value).astype(np.uint16)
-    seconds, sentences = np.where(same_number, seconds, np.nan), list[str]()
+    seconds, sentences = np.where(same_number, seconds, np.nan), _recording.copies(counts, paths)
     if clock is not None:  # a rate is that of all frames; clocks of cameras may be wrong
         every = 1 if np.ndim(np.asarray(clock)) else wanted.step or 1
         by_clock = every * _recording.stamps(clock, len(counts), name)
@@ -201,7 +201,7 @@ def flir(
             if rising.any():
                 _recording.check_times(seconds[rising], "s", by_clock[rising], name)
         except ValueError as error:
-            sentences.append(str(error))
+            sentences.append(re.sub("Must .*", "Must agree: clock= is used.", str(error)))
         seconds = by_clock
     about = {"source": name, "format": f"FLIR, {form.codec}", "byte_order": order}
     about |= {"byte_order_by": by, **attrs}
@@ -379,8 +379,7 @@ def _attrs(camera: dict[str, Any], seconds: float | None = None) -> dict[str, An
 def _following(content: _Content, start: int, stop: int, *, still: bool) -> int | None:
     """Place of the frame behind a frame from start to stop; None at the end of the file."""
     # Behind the last record lie zeros, or bytes that fill the frame up to a multiple of 4.
-    filled = start + -(-(stop - start) // _ALIGNED) * _ALIGNED
-    for behind in (stop, filled):
+    for behind in (stop, start + -(-(stop - start) // _ALIGNED) * _ALIGNED):
         if (byte := _NO_ZERO.search(content, behind)) is None:
             return None
         at, head = byte.start(), content[byte.start() : byte.start() + _HEADER]

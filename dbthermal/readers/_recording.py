@@ -43,6 +43,8 @@ _PIECES: Final = 2**14  # of less than 1 kB in a file
 _NEAR: Final = 256  # of neighbours, as signed numbers; of DJI's temperatures [0.1 K] median 3
 _LISTED: Final = 16  # names of arrays in a message
 ORDERS: Final = {"<": "little", ">": "big"}  # of bytes, as numpy and people write them
+_MOMENT: Final = 40  # longest text of a date [character]
+_LATEST: Final = 1e11  # time since 1970 [s], in the year 5138; milliseconds since 1970 are more
 _JITTER: Final = 0.25  # of the times in names of files [frame]
 _DATE: Final = re.compile(
     r"(20\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)\D?(\d\d)(?:\D?(\d+))?$|(1\d{9})(\.\d+|\d{3}|\d{6}|\d{9})$"
@@ -105,6 +107,15 @@ def moment(text: str) -> float:
         second = datetime.strptime("".join(whole), "%Y%m%d%H%M%S").replace(tzinfo=UTC)
         return second.timestamp() + float(f"0.{fraction}")
     return float(f"{unix}.{behind.removeprefix('.')}") if unix else np.nan
+
+
+def dates(texts: Iterable[Any]) -> Array:
+    """Seconds since 1970 of dates by ISO 8601, in UTC without a zone; ValueError of other texts."""
+    seconds = list[float]()
+    for text in (str(np.asarray(it).astype("U")) for it in texts):
+        date = datetime.fromisoformat(text if len(text) <= _MOMENT else "")
+        seconds.append(date.replace(tzinfo=date.tzinfo or UTC).timestamp())
+    return np.array(seconds)
 
 
 @contextmanager
@@ -253,8 +264,7 @@ def another_rate(rate: Any, seconds: Array, name: str) -> list[str]:
         stated = float(np.asarray(rate).item())
         if abs((len(seconds) - 1) - seconds[-1] * stated) > 0.5 and 0 < stated < _FASTEST:
             rule = "Must be the rate of recording; that in the file may be of playing it"
-            label = f"'{name}' states {stated:g} frames a second, and clock= another rate"
-            return [f"{label}. {rule}."]
+            return [f"'{name}' states {stated:g} frames a second, and clock= another rate. {rule}."]
     return []
 
 
@@ -265,22 +275,26 @@ def byte_order(name: str, value: str) -> str:
     return "<" if value == "little" else ">"
 
 
-def stamps(clock: Clock | None, frames: int, name: str) -> Array:
-    """Times (time) [s] of frames, from a frame rate [Hz] or from their times [s]."""
+def stamps(clock: Clock | None, frames: int, name: str, *sentences: str) -> Array:
+    """Times (time) [s] of frames, from a frame rate [Hz] or from their times [s] or dates."""
     if clock is None:
         rule = "Must be the frame rate [Hz], or the time of each frame [s], in a file as ISO 8601"
-        raise ValueError(f"Missing clock= for '{name}', which tells no times. {rule} or numbers.")
-    stated = schema.check_numbers(xr.DataArray(clock), f"the clock of '{name}'", "s")
+        label = f"Missing clock= for '{name}', which tells no times"
+        raise ValueError(" ".join([f"{label}. {rule} or numbers.", *sentences]))
+    stated = xr.DataArray(clock)
+    with suppress(ValueError):  # of no dates, as of durations
+        stated = xr.DataArray(dates(np.ravel(clock))) if stated.dtype.kind in "OUM" else stated
+    schema.check_numbers(stated, f"the clock of '{name}'", "s")
     values = stated.values.astype(np.float64)
-    rule = f"Must be a rate in (0, {_FASTEST:g}] Hz, or one finite time each in s"
+    rule = f"Must be a rate in (0, {_FASTEST:g}] Hz, or one finite time each in seconds"
     if values.ndim == 0:
         if not 0 < values <= _FASTEST:
             raise ValueError(f"Invalid clock {values} of '{name}'. {rule}.")
         return np.arange(frames) / float(values)
-    fits = values.shape == (frames,) and np.isfinite(values).all()
+    fits = values.shape == (frames,) and np.abs(values).max() < _LATEST  # and no NaN
     if not fits or 0 < np.ptp(values) * _FASTEST < frames - 1:
         label = f"clock of shape {values.shape} for {frames} frames of '{name}'"
-        raise ValueError(f"Invalid {label}. {rule}.")
+        raise ValueError(f"Invalid {label}, up to {values.max(initial=0.0):g}. {rule}.")
     return np.asarray(values - values[0])
 
 
@@ -298,7 +312,7 @@ def recording(
     if np.any(steps < 0):
         place = stamped[1:][steps < 0][0]
         label = f"frame {place} is {-steps[steps < 0][0]:.3f} s before the one that precedes it"
-        rule = "Must rise; else give the times as clock="
+        rule = "Must rise: correct them, or state the rate, clock= [Hz]"
         raise ValueError(f"Unordered times in '{name}': {label}. {rule}.")
     stamped = np.delete(stamped, 1 + np.flatnonzero(steps == 0))
     stands = ~np.isin(np.arange(seconds.size), stamped)
@@ -388,6 +402,15 @@ def _doubts_on_order(counts: Counts, name: str) -> list[str]:
             rule = "Must be (time, y, x): transpose it if it is not"
             return [f"Axis {axis} of '{name}' may be time, by how its neighbours differ. {rule}."]
     return []
+
+
+def copies(counts: Counts, paths: Sequence[Path]) -> list[str]:
+    """Sentence on files of a frame each, whose counts are those of the file before."""
+    files = range(1, len(paths) if len(counts) == len(paths) else 0)
+    if not (twins := [n for n in files if np.array_equal(*counts[n - 1 : n + 1])]):
+        return []
+    label = f"'{paths[twins[0] - 1].name}' and '{paths[twins[0]].name}', {len(twins)} in all"
+    return [f"Same counts in {label}. Must be different frames: is one a copy?"]
 
 
 def png_size(content: bytes, place: str) -> tuple[int, int, int]:

@@ -180,7 +180,7 @@ def sequence(path: str | Path, *, clock: Clock | None = None, memory: float = ME
 def _frames(path: Path, form: np.dtype[Any], start: int, memory: float) -> npt.NDArray[Any]:
     """Frames, each with its header and counts, behind a start; the file must hold whole ones."""
     size = path.stat().st_size
-    number, remainder = divmod(size - start, form.itemsize)
+    number, remainder = divmod(max(0, size - start), form.itemsize)
     if number < 1 or remainder:
         label = f"{size} bytes of '{path.name}': {number} frames and {remainder} bytes"
         rule = f"Must be whole frames of {form.itemsize} bytes behind {start}, as stated"
@@ -192,10 +192,8 @@ def _frames(path: Path, form: np.dtype[Any], start: int, memory: float) -> npt.N
 def _sfmov(path: Path, memory: float) -> tuple[Counts, Array | None]:
     """Counts behind the lines of a header, and their times, if an .inc tells the rate."""
     with path.open("rb") as stream:
-        content = stream.read(_LONGEST)
-    header, mark, _ = content.partition(b"\nDATA")
-    lines = _lines(header)
-    names = ("NumDPs", "yPixls", "xPixls")
+        header, mark, _ = (content := stream.read(_LONGEST)).partition(b"\nDATA")
+    lines, names = _lines(header), ("NumDPs", "yPixls", "xPixls")
     if not mark or not all(lines.get(name, "").isdecimal() for name in names):
         rule = f"Must have {', '.join(names)} and DATA within {_LONGEST} bytes"
         raise ValueError(f"Invalid header of '{path.name}'. {rule}.")

@@ -126,5 +126,4 @@ def spectrum(
     attrs: dict[str, Any] = {**dict.fromkeys(NOTES, ""), **notes, "source": name}
     attrs["unphysical_values"] = int(np.sum((emissivity < 0) | (emissivity > 1)))
     axes = {"wavelength": ("wavelength", wavelength * 1e-6, schema.COORDINATES["wavelength"].attrs)}
-    variables = schema.variables("spectrum", {"emissivity": emissivity})
-    return xr.Dataset(variables, axes, attrs)
+    return xr.Dataset(schema.variables("spectrum", {"emissivity": emissivity}), axes, attrs)

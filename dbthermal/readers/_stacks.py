@@ -81,8 +81,8 @@ def tiff(
         Unit of the pixels. Temperatures, also as whole numbers (temperature-linear data), are
         refused: the camera made them with an emissivity, and mixtures add up in counts only.
     clock : float or array_like, optional
-        Frame rate [Hz] or time of each frame [s]. At a rate, files with a frame each whose numbers,
-        or dates, leave some out have gaps in time there.
+        Frame rate [Hz], or time [s] or date of each frame. At a rate, files with a frame each whose
+        numbers, or dates, leave some out have gaps in time there.
     rows : slice, optional
         Rows of the image to keep; no others take memory.
     memory : float
@@ -141,10 +141,7 @@ def tiff(
     if len({size, *lengths[:-1]}) > 1:
         rule = "Must be parts of one recording, in the order of time, of which the last is shorter"
         sentences.append(f"'{name}' have {[size, *lengths]!s:.60} frames. {rule}.")
-    twins = [n for n in range(1, len(paths)) if np.array_equal(*counts[n - 1 : n + 1])]
-    if twins and len(counts) == len(paths):
-        label = f"'{paths[twins[0] - 1].name}' and '{paths[twins[0]].name}', {len(twins)} in all"
-        sentences.append(f"Same counts in {label}. Must be different frames: is one a copy?")
+    sentences += _recording.copies(counts, paths)
     order = " and ".join(sorted({_recording.ORDERS[page.order] for page in pages}))
     form = "PNG" if pages[0].codec == "png" else "TIFF"
     decided = {"byte_order": order, "byte_order_by": "header", "format": form}

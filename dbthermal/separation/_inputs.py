@@ -164,7 +164,7 @@ def check(  # noqa: PLR0913 - all that the user gives, by name
     if emissivity is not None and not method.knows_emissivity:
         raise ValueError(f"Invalid emissivity for method '{name}', which estimates it. Omit it.")
     if emissivity is None and method.knows_emissivity:
-        raise ValueError(f"Missing emissivity. Method '{name}' must be given one.")
+        raise ValueError(f"Missing emissivity= for method '{name}'. Must be stated.")
     curves = responses.curves(response, bands, response_kind)
     if pool is not None and not method.pools:
         raise ValueError(f"Invalid pool for method '{name}', which does not pool.")

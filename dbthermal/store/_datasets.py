@@ -155,7 +155,8 @@ def chunks_in_turn() -> AbstractContextManager[Any]:
 
 def _check(dataset: xr.Dataset) -> None:
     """Refuse values and attributes that zarr cannot hold, and attributes that decode values."""
-    # Attributes of the dataset and its variables.
+    # Unit of the temperatures; attributes of the dataset and its variables.
+    schema.check_kelvin(dataset)
     attributes = {f"'{name}'": variable.attrs for name, variable in dataset.variables.items()}
     for owner, attrs in {"the dataset": dataset.attrs, **attributes}.items():
         for key, value in attrs.items():
@@ -325,9 +326,6 @@ def _link(source: str | Path, target: str | Path) -> None:
 
 def _with_text_as(dataset: xr.Dataset, kind: str, dtype: np.dtype[Any]) -> xr.Dataset:
     """Convert text from a kind of NumPy to another kind."""
-    texts = {
-        name: (variable.dims, variable.to_numpy().astype(object).astype(dtype), variable.attrs)
-        for name, variable in dataset.variables.items()
-        if variable.dtype.kind == kind
-    }
-    return dataset.assign(texts)
+    kept = {name: it for name, it in dataset.variables.items() if it.dtype.kind == kind}
+    texts = {n: it.to_numpy().astype(object).astype(dtype) for n, it in kept.items()}
+    return dataset.assign({n: (it.dims, texts[n], it.attrs) for n, it in kept.items()})

@@ -75,7 +75,8 @@ class CheckedStore(SummedStore):
             group = json.loads(content or b"")
             self.attrs: dict[str, Any] = group["attributes"]
         except (KeyError, TypeError, ValueError, RecursionError) as error:
-            raise ValueError(f"Invalid {self._named(GROUP)}. Must be a zarr group.") from error
+            label = self._named(GROUP) if content else f"store '{self.root}': it has no '{GROUP}'"
+            raise ValueError(f"Invalid {label}. Must be a zarr group.") from error
         if group.get("node_type") == "array":
             rule = f"Must be the store that it is in: '{self.root.parent}'"
             raise ValueError(f"Invalid store '{self.root}', an array. {rule}.")

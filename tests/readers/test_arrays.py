@@ -123,7 +123,7 @@ test_what_is_no_array_of_counts = refused(
         ),
         *(
             (scene(), {"clock": one}, "Invalid dtype .* of the clock of 'array'")
-            for one in (True, "10", np.arange(3).astype("M8[s]"))
+            for one in (True, "10", ["10", "11", "12"], np.arange(3).astype("m8[s]"))
         ),
         (scene(), {"clock": MILLISECONDS}, "Invalid units 'ms' of the clock of 'array'"),
     ],
@@ -218,7 +218,7 @@ def test_times_of_an_array_agree_with_the_clock(
         ([0, 100, 200], None, "Missing unit of the times of 'a.h5', which rise by 100 a frame"),
         ([0.0, 0.2, 0.1], "s", "frame 2 at 0.1 s, after 0.2 s. Must rise"),
         ([0, 1, 2], None, "Missing unit of the times of 'a.h5', which rise by 1 a frame"),
-        ([5.0, 5.1], None, "Missing clock= for 'a.h5', which tells no times"),
+        ([5.0, 5.1], None, "or numbers. Times 'time' of 'a.h5' are 2 for 3 frames. Must be"),
     ],
 )
 def test_times_of_a_file_are_its_clock(
@@ -230,6 +230,39 @@ def test_times_of_a_file_are_its_clock(
     with raising(re.escape(expected) if isinstance(expected, str) else None):
         made = readers.array(tmp_path / "a.h5", unit="count")
         assert_allclose(made["exposure_time"], expected, atol=1e-9)  # [s]
+
+
+@pytest.mark.parametrize("name", ["zeit", "clock_s", "Acquisition_Stamp", "elapsed", "seconds"])
+def test_further_names_of_times(tmp_path: Path, name: str) -> None:
+    """With a value for each frame they are times, but not beside such of the usual name."""
+    path, times = tmp_path / "a.h5", [5.0, 5.2, 5.4]
+    assert_allclose(read(hdf5(path, **{name: times}), clock=None).time, [0, 0.2, 0.4])
+    with pytest.raises(ValueError, match=r"frame 1 at 0\.2 .*, by clock= at 0\.1 s"):
+        read(hdf5(path, **{name: times}))
+    both = hdf5(path, **{name: times, "time": [0.0, 0.1, 0.2]})
+    assert_allclose(read(both, clock=None).time, [0, 0.1, 0.2])
+    for others in ({name: np.arange(9.0)}, {"exposure_time": [0.01] * 3}, {"time_zone": [2] * 3}):
+        assert not read(hdf5(path, **others)).attrs.get("warnings")
+
+
+def test_dates_as_a_clock() -> None:
+    """ISO 8601, datetime, and dates of NumPy and pandas; milliseconds since 1970 are refused."""
+    dates = pd.date_range("2026-05-01 01:59:59.8", periods=3, freq="100ms", tz="Europe/Berlin")
+    texts = [it.isoformat() for it in dates]
+    for clock in (
+        dates,
+        pd.Series(dates),
+        texts,
+        [*dates.to_pydatetime()],
+        dates.tz_localize(None),
+    ):
+        assert_allclose(read(scene(), clock=clock).time, [0, 0.1, 0.2], atol=1e-6)  # [s]
+    with pytest.raises(ValueError, match=r"up to 1\.78e\+12\. Must be .* each in seconds"):
+        read(scene(), clock=1.78e12 + 100.0 * np.arange(3))
+    with pytest.raises(
+        ValueError, match=r"Must rise: correct them, or state the rate, clock= \[Hz"
+    ):
+        read(scene(), clock=[0.0, 0.2, 0.1])
 
 
 def test_a_gap_in_the_times_is_named() -> None:
@@ -457,7 +490,10 @@ def test_times_beside_frames(tmp_path: Path, name: str) -> None:
             read(hdf5(path, **{name: times}))
     for times in (45000 + np.arange(3) / 864e3, 1_000_000 * np.arange(3)):  # of tables, of Windows
         assert_array_equal(read(hdf5(path, **{name.removesuffix("_s"): times})).counts, scene())
-    assert_array_equal(read(hdf5(path, **{name: np.arange(9.0)})).counts, scene())
+    with pytest.warns(
+        UserWarning, match=rf"Times '{name}' of 'a\.h5' are 9 for 3 frames\. Must be"
+    ):
+        assert_array_equal(read(hdf5(path, **{name: np.arange(9.0)})).counts, scene())
     with pytest.raises(ValueError, match=rf"Invalid axes of 'frames' .* '{name}' has 32\. Must be"):
         read(hdf5(path, **{name: np.arange(32.0)}))
     assert_refused("Invalid times", read, hdf5(path, **{f"other/{name}": np.arange(3.0)}))
@@ -524,11 +560,12 @@ def test_chunks_are_not_too_many(tmp_path: Path) -> None:
 
 
 def test_times_are_as_many_as_frames(tmp_path: Path) -> None:
-    """A scale of another length is refused before it is read; an attribute is one value."""
+    """A scale of another length is named, and not read; an attribute is one value."""
     with h5py.File(hdf5(tmp_path / "a.h5"), "r+") as file:
         file.create_dataset("time", (10**9,), "f8", chunks=(10**6,)).make_scale("time")
         file["frames"].dims[0].attach_scale(file["time"])
-    assert_refused(r"Invalid number 1000000000 of times .* Must be 3", read, tmp_path / "a.h5")
+    with pytest.warns(UserWarning, match=r"Times 'time' of 'a.h5' are 1000000000 for 3 frames"):
+        read(tmp_path / "a.h5")
     assert_refused(
         "^Refused 'a.h5': .* 'units'", read, hdf5(tmp_path / "a.h5", _units=["count"] * 2)
     )

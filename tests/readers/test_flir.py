@@ -123,6 +123,10 @@ def test_pictures(tmp_path: Path, codec: str) -> None:
     assert read.attrs["source"] == "IR_8.jpg to IR_10.jpg"
     with pytest.raises(ValueError, match=r"Unordered files: the numbers of 'IR_8\.jpg' do not"):
         readers.flir(sorted(paths))
+    copy = sequence(counts[:1], codec, seconds=[1.5e9 + 1], sums=True)
+    paths[1].write_bytes(jpeg(copy))
+    with pytest.warns(UserWarning, match=r"Same counts in 'IR_8\.jpg' and 'IR_9\.jpg', 1 in all"):
+        readers.flir(paths)
 
 
 def test_lost_frames_and_clocks(path: Path) -> None:
@@ -139,7 +143,9 @@ def test_lost_frames_and_clocks(path: Path) -> None:
         flir(path, sequence(counts[:3], seconds=[1e9, 1e9 + 1, 1e9 + 0.5]))
     with pytest.warns(UserWarning, match=r"times of 'a\.seq': frame 1 at 1 s, by clock= at 0\.02"):
         assert_allclose(readers.flir(path, clock=50.0).time, [0, 0.02, 0.04])
-    with pytest.warns(UserWarning, match=r"frame 1 at 0\.5 s, by clock= at 0\.04.* half a frame"):
+    with pytest.warns(
+        UserWarning, match=r"frame 1 at 0\.5 s, by clock= at 0\.04 s.* clock= is used"
+    ):
         read = readers.flir(path, clock=50.0, frames=slice(0, 3, 2))
     assert_allclose(read.time, [0, 0.04])
     assert "warnings" not in readers.flir(path, clock=1.01, frames=slice(2)).attrs

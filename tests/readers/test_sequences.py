@@ -118,6 +118,9 @@ def test_raw(tmp_path: Path) -> None:
     path.write_bytes(b"h" * 100 + b"".join(b"frame" + image.tobytes() for image in counts))
     assert_array_equal(bare(path, header=100, frame_header=5).counts, counts)
     assert_refused(r"4723 bytes of 'a\.raw': 3 frames and 115 bytes", bare, path)
+    assert_refused(
+        r"4723 bytes of 'a\.raw': 0 frames and 0 bytes.* behind 9999", bare, path, header=9999
+    )
     path.write_bytes(counts.astype(">u2").tobytes())
     assert_array_equal(bare(path, byte_order="big").counts, counts)
     assert_refused(r"rougher than with bytes swapped", bare, path)

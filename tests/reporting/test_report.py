@@ -77,6 +77,16 @@ def test_numbers_are_those_of_the_scene(tmp_path: Path) -> None:
     assert all(one.startswith(("data:", "#")) for one in sources)
 
 
+def test_the_answer_of_a_black_body_and_of_flagged_pixels(tmp_path: Path) -> None:
+    """What a method assumes stands beside the share; flagged pixels are not completed."""
+    data = scene(method="apparent")
+    data["status"].values[:] = schema.Status.GRAY
+    dbthermal.report(data, tmp_path / "scene.html")
+    head = (tmp_path / "scene.html").read_text("utf-8").partition("<h2")[0]
+    assert "Object, flagged and not measured, from " in head
+    assert "Measured, as of a black body: 0% of the pixels; completed, not measured: 0%." in head
+
+
 def test_the_answer_and_the_author_come_first(tmp_path: Path) -> None:
     """How hot, how sure, how much, and emissivities of two materials each by its own pixels."""
     data = scene(source="a.tif and b.tif")

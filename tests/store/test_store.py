@@ -30,7 +30,7 @@ DTYPES = st.sampled_from(["uint16", "float32", "float64", "int64", "bool"])
 @pytest.fixture
 def capture() -> xr.Dataset:
     """Two bands of three frames, with a gap in one and all that may accompany them."""
-    temperature = np.arange(24, dtype="float32").reshape(3, 2, 4)
+    temperature = 280 + np.arange(24, dtype="float32").reshape(3, 2, 4)
     temperature[1, 1, 1] = np.nan
     return xr.Dataset(
         {
@@ -102,6 +102,21 @@ def test_nothing_is_saved_inside_a_store(capture: xr.Dataset, tmp_path: Path) ->
         store.save(capture["counts"], tmp_path / "c.zarr", RECORD)  # type: ignore[arg-type]
 
 
+def test_degrees_celsius_are_not_saved_as_kelvin(capture: xr.Dataset, tmp_path: Path) -> None:
+    """Under their own unit, or as NaN alone, temperatures are saved."""
+    celsius = capture.assign(object_temperature=(film := capture["object_temperature"]) - 273.15)
+    for units in ({}, {"units": "K"}):
+        celsius["object_temperature"].attrs = units
+        assert_refused(
+            "temperature 12.4. Must be in kelvin", store.save, celsius, tmp_path / "a.zarr", RECORD
+        )
+    store.save(capture.assign(object_temperature=film * np.nan), tmp_path / "a.zarr", RECORD)
+    celsius["object_temperature"].attrs = {"units": "degC"}
+    store.save(celsius, tmp_path / "a.zarr", RECORD)
+    chunked = store.open_dataset(tmp_path / "a.zarr")
+    assert chunked["object_temperature"].units == "degC"
+
+
 def test_opening_reads_no_values(capture: xr.Dataset, tmp_path: Path) -> None:
     """Values are read when they are used: a later save is told by a dataset opened before it."""
     store.save(capture, tmp_path / "a.zarr", RECORD)
@@ -110,6 +125,12 @@ def test_opening_reads_no_values(capture: xr.Dataset, tmp_path: Path) -> None:
     assert_refused(r"Since it was opened, replaced file 'counts/c/0/0/0/0'", opened.load)
     with pytest.raises(FileNotFoundError, match=r"No dataset '.*b\.zarr'"):
         store.open_dataset(tmp_path / "b.zarr")
+    (tmp_path / "b.zarr").mkdir()
+    assert_refused(
+        r"Invalid store '.*b\.zarr': it has no 'zarr\.json'",
+        store.open_dataset,
+        tmp_path / "b.zarr",
+    )
     zarr.open_group(tmp_path / "c.zarr", mode="w").create_array("a", shape=(2, 3), dtype="u2")
     with pytest.warns(UserWarning, match="No checksums"):
         assert_refused("c.zarr'. Must name the dims", store.open_dataset, tmp_path / "c.zarr")
