@@ -26,7 +26,7 @@ BUDGET = {
     "simulation": (523, 1),
     "store": (1358, 6),
 }
-INSTALLED = 35_810  # lines of all rooms
+INSTALLED = 35_809  # lines of all rooms
 
 PRONOUNS = {
     *("one", "other", "others", "own", "part", "parts", "some", "here", "there", "told", "known"),
