@@ -371,9 +371,8 @@ def measured(values: npt.NDArray[Any] | xr.DataArray) -> Any:
 def require_measured(values: npt.NDArray[Any], label: str) -> None:
     """Refuse samples that are no numbers, see `measured`."""
     if not np.all(measured(values)):
-        raise ValueError(
-            f"Invalid {label}: NaN or infinite, or beyond {LARGEST:g}. Must be finite."
-        )
+        message = f"Invalid {label}: NaN or infinite, or beyond {LARGEST:g}"
+        raise ValueError(f"{message}. Must be finite.")
 
 
 def check(
@@ -461,12 +460,13 @@ def check_variable(array: xr.DataArray, variable: Variable, label: str) -> None:
 
 
 def check_kelvin(result: xr.Dataset) -> xr.Dataset:
-    """Refuse a film of degrees Celsius, by a row of its first frame: of a store a single chunk."""
+    """Refuse a film of degrees or differences, by a row of its first frame: a chunk of a store."""
     film = result.get("object_temperature", xr.DataArray(0.0))
     kind = (film.dims, str(film.attrs.get("units", "K")), film.dtype.kind, film.size > 0)
     is_read = film.chunks is None and kind == (("time", "y", "x"), "K", "f", True)
     if is_read and (level := float(film[0, film.sizes["y"] // 2].median())) < _numbers.KELVIN[0]:
-        raise ValueError(f"Invalid object temperature {level:.1f}. Must be in kelvin, not Celsius.")
+        rule = "Must be in kelvin, not Celsius; a difference must have another name"
+        raise ValueError(f"Invalid object temperature {level:.1f}. {rule}.")
     return result
 
 

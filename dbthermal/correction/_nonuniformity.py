@@ -23,7 +23,7 @@ OUTLIER: Final = 6.0
 
 _PARAMETERS = {"blackbody_temperatures", "threshold", "detector_maximum", "by_camera"}
 _PARAMETERS |= {"offset_renewed"}
-_PATTERN = {"offset_std", "gain_std", "centre"}
+_PATTERN = ("offset_std", "gain_std", "centre")
 _PASSES = 2  # fits of the mean, of which the first finds the outliers
 _LEVELS = 65536  # samples of a band, about, for the levels of a capture
 _ROUNDING = 0.01  # differences between pixels that are rounding [count], or [1] of logarithms
@@ -204,7 +204,7 @@ def renew_offset(correction: xr.Dataset, flat: xr.DataArray) -> xr.Dataset:
     level = np.mean(corrected, axis=(1, 2), where=good, keepdims=True)
     offset = np.where(good, offset - (corrected - level), 0.0)
     renewed = {"offset": correction["offset"].copy(data=offset)}
-    if correction.keys() >= _PATTERN and "level" in correction:
+    if correction.keys() >= {*_PATTERN} and "level" in correction:
         # The offset has the image's error, v, instead of that of n images, v / n.
         images = correction.sizes["temperature"]
         renewed["offset_std"] = correction["offset_std"] * np.sqrt(images)
@@ -265,7 +265,7 @@ def correct(
         counts=(counts.dims, corrected, schema.STAGES["corrected"]["counts"].attrs),
         status=(("y", "x"), status, Status.cf_attrs(schema.STATUS)),
     )
-    if correction.keys() >= _PATTERN:
+    if correction.keys() >= {*_PATTERN}:
         result["pattern_std"] = _pattern_std(correction, result["counts"], status == 0)
     attrs = {f"gain_offset_{key}": it for key, it in correction.attrs.items() if key in _PARAMETERS}
     attrs |= {"gain_offset_corrected": 1 - correction.attrs.get("by_camera", 0)}
@@ -292,8 +292,7 @@ def _pattern_std(correction: xr.Dataset, counts: xr.DataArray, good: Mask) -> xr
     """Deviation (band) [count] of the pattern at the levels of good pixels; NaN of none."""
     names = [str(name) for name in counts["band"].values]
     places = schema.band_positions(correction, names, "the correction")
-    kinds = ("offset_std", "gain_std", "centre")
-    offset, gain, centre = (correction[name].values[places] for name in kinds)
+    offset, gain, centre = (correction[name].values[places] for name in _PATTERN)
     step, level = stride(counts.shape[1:], _LEVELS), np.full(len(names), np.nan)
     sample = counts[:, ::step, ::step, ::step].values[:, :, good[::step, ::step]].astype(np.float64)
     if sample.size:

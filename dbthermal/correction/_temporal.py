@@ -360,7 +360,6 @@ def undo_drift(
                 functions = _smooth.polynomial_basis(time[frames], min(order, int(frames.sum())))
                 fitted = functions @ (functions.T @ values[frames])
                 curve[frames] = fitted - fitted[0]  # change since the segment's first frame
-
     drifts = curves[..., np.newaxis, np.newaxis]
     undo = _arrays.changed(counts, lambda values: values - drifts, lazy=lazy)
     drift = schema.variables("corrected", {"drift": curves})

@@ -301,8 +301,7 @@ class Controller:
 
     def send(self, identifier: Id, channel: int = 0, value: int = 0, data: bytes = b"") -> None:
         """Send a message without a reply to the motor."""
-        message = Message(identifier, channel, value, self.motor, HOST, data)
-        self._transport.write(encode(message))
+        self._transport.write(encode(Message(identifier, channel, value, self.motor, HOST, data)))
 
     def begin(self, identifier: Id, channel: int = 0, data: bytes = b"") -> None:
         """Send the start of a motion, once earlier ends are forgotten; WheelError as `check`."""

@@ -258,8 +258,7 @@ class Boson(Closing):
         # Data of the size and with the meaning of this reading.
         size, name = struct.calcsize(reading.layout), reading.name
         if len(data) != size:
-            message = f"Invalid reply of {len(data)} bytes to '{name}'. Must have {size}."
-            raise BosonError(message)
+            raise BosonError(f"Invalid reply of {len(data)} bytes to '{name}'. Must have {size}.")
         try:
             return reading.convert(*struct.unpack(reading.layout, data))
         except ValueError as error:
@@ -334,8 +333,7 @@ class Boson(Closing):
     def _command(self, name: str, command: int, data: bytes = b"") -> None:
         """Send a command that changes the camera, once; its reply must be empty."""
         if reply := self._exchange(name, command, data):
-            size = len(reply)
-            raise BosonError(f"Invalid reply of {size} bytes to '{name}'. Must be empty.")
+            raise BosonError(f"Invalid reply of {len(reply)} bytes to '{name}'. Must be empty.")
 
     def _exchange(self, name: str, command: int, data: bytes = b"", *, repeats: int = 0) -> bytes:
         """Send a request, again under a new number if no reply comes; return the reply's data."""

@@ -37,7 +37,6 @@ KIND: Final = "T"  # the library's letter of the rig's thermocouples
 KELVIN: Final = 2  # the library's number of the unit; 0 is °C, 1 °F, 3 °R
 OPEN_TIMEOUT: Final = 30.0  # [s] the library downloads the firmware first
 POLL: Final = 0.05  # [s] between two progress requests
-
 SCAN_AGE: Final = 1.0  # longest time for which a scan gives the readings of its channels [s]
 
 # Meaning of the library's error numbers; 15 and 16 are often taken for one another.

@@ -29,9 +29,9 @@ from dbthermal.readers._recording import MEMORY, Clock
 
 # Names of times, perhaps with their unit, of an array beside another, or a dim.
 _TIMES: Final = re.compile("((frame_?)?time(s|_?stamps?)?|t)(_(s|ms|us|ns))?", re.IGNORECASE)
-# Further names, of an array with a value for each frame; durations and shutters' are no times.
-_LIKE_TIMES: Final = "(?!.*(exposure|integration|zone|ffc|nuc)).*(time|zeit|clock|stamp|seconds|"
-_ANY_TIMES: Final = re.compile(f"{_TIMES.pattern}|{_LIKE_TIMES}elapsed).*", re.IGNORECASE)
+# And further names, of an array with a value for each frame that rises: durations do not.
+_LIKE_TIMES: Final = ".*(time|zeit|clock|stamp|seconds|elapsed).*"
+_ANY_TIMES: Final = re.compile(f"{_TIMES.pattern}|{_LIKE_TIMES}", re.IGNORECASE)
 # Names of dims by their place, and dims of an array without names, in any case of letters.
 _DIMS: Final = (f"{_TIMES.pattern}|frames?|images?", "y|rows?|height", "x|col(umn)?s?|width")
 _WITHOUT_NAME: Final = r"||None|(phony_)?dim_\d+"
@@ -246,13 +246,21 @@ def _times_of(arrays: dict[str, Any], name: str, path: Path) -> dict[str, Any]:
     around = next((it for it in groups if not any(key.startswith(it) for key in films)), name)
     near = {n: it for (place, n), it in lines.items() if f"{place}/".startswith(around)}
     near |= {key: array for (place, key), array in lines.items() if place == group}
-    fitting = {n: it for n, it in near.items() if it.size == frames and it.dtype.kind not in "bV"}
+    fitting = {n: it for n, it in near.items() if it.size == frames and _may_be_times(n, it)}
     named = {n: it for n, it in near.items() if _TIMES.fullmatch(n) and it.size > 1}
     for key in (key for key, times in named.items() if times.size in {*image} - {frames}):
         label = f"'{name}' of '{path.name}', {frames} frames of {image}"
         rule = "Must be (time, y, x), in MATLAB (y, x, time): transpose it, or rename the times"
         raise ValueError(f"Invalid axes of {label}: '{key}' has {named[key].size}. {rule}.")
     return ({key: fitting[key] for key in fitting if key in named} or fitting) | named
+
+
+def _may_be_times(name: str, values: Any) -> bool:
+    """Tell whether an array is of times: by its usual name, of texts or dates, or as it rises."""
+    if _TIMES.fullmatch(name) or values.dtype.kind not in "iuf":
+        return values.dtype.kind not in "bV"
+    numbers = np.ravel(values[...])
+    return bool(np.all(numbers[1:] > numbers[:-1]))
 
 
 def _opened(path: Path, name: str | None, stack: ExitStack) -> tuple[Any, dict[str, Any]]:

@@ -192,7 +192,8 @@ def _frames(path: Path, form: np.dtype[Any], start: int, memory: float) -> npt.N
 def _sfmov(path: Path, memory: float) -> tuple[Counts, Array | None]:
     """Counts behind the lines of a header, and their times, if an .inc tells the rate."""
     with path.open("rb") as stream:
-        header, mark, _ = (content := stream.read(_LONGEST)).partition(b"\nDATA")
+        content = stream.read(_LONGEST)
+    header, mark, _ = content.partition(b"\nDATA")
     lines, names = _lines(header), ("NumDPs", "yPixls", "xPixls")
     if not mark or not all(lines.get(name, "").isdecimal() for name in names):
         rule = f"Must have {', '.join(names)} and DATA within {_LONGEST} bytes"

@@ -194,10 +194,8 @@ def separated(
     if alone is None and displaced and pooled:
         alone, _ = separated(replace(inputs, labels=None), workers=workers, progress=progress)
     names += [_COVARIANCE, "drift_std"] if inputs.method.pools else []
-    arrays: dict[str, Any] = dict.fromkeys(names)
-    if alone is not None and not displaced:
-        arrays |= {name: alone[name].values for name in _OVERWRITTEN}
-    result = separated_dataset(capture, arrays)
+    films = {} if alone is None or displaced else {it: alone[it].values for it in _OVERWRITTEN}
+    result = separated_dataset(capture, {**dict.fromkeys(names), **films})
     # Separate; for displaced cameras and materials, the number of passes is not known beforehand.
     total = None if displaced or pooled else result["status"].size
     with (
@@ -234,9 +232,8 @@ def separated(
     metadata = inputs.response.attrs | capture.attrs
     notes = [np.atleast_1d(data.attrs.get("warnings", [])) for data in (inputs.response, capture)]
     doubts = dict.fromkeys(str(sentence) for note in notes for sentence in note)
-    counts_per_kelvin = np.array([curve.reference_slope for curve in inputs.curves])
-    attrs = {"units": "count", "long_name": "noise, as used"}
-    result["noise"] = xr.DataArray(inputs.noise * counts_per_kelvin, dims="band", attrs=attrs)
+    noise = inputs.noise * [curve.reference_slope for curve in inputs.curves]
+    result["noise"] = "band", noise, {"units": "count", "long_name": "noise, as used"}
     ratios = () if inputs.method.pools else ("reflection_ratio", "reflection_ratio_std")
     result = result.assign_attrs(
         method=inputs.method.name,

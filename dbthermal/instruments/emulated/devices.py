@@ -240,8 +240,7 @@ class EmulatedApt(Line):
                 self.start(way + home.offset, home.velocity, homing=True)
             case Id.MOT_MOVE_ABSOLUTE if message.data:
                 target = _apt.parse(_apt.Position, message).position
-                velocity = self._kept[Id.MOT_SET_VELPARAMS].velocity
-                self.start(target - self.position, velocity)
+                self.start(target - self.position, self._kept[Id.MOT_SET_VELPARAMS].velocity)
             case Id.MOT_MOVE_STOP:  # at once, ramps are left out
                 self._drive = None
                 self.reply(Id.MOT_MOVE_STOPPED)

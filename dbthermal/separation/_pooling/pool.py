@@ -480,7 +480,8 @@ def hold(
     mean = neighbour_mean(square * variance, common | (stay & sound), _VICINITY)
     constant = np.where(valid & ~sound, np.nan_to_num(mean), 0.0)
     factor, film = square * common, pooled["object_temperature_std"].values
-    maps = [(pooled[n].values, a.values) for n, a in per_pixel.items() if apart and "x" in a.dims]
+    copied = per_pixel.drop_dims([] if apart else "x").items()
+    maps = [(pooled[name].values, array.values) for name, array in copied if "x" in array.dims]
     if restore is not None and stay.any():
         restore(stay)
     wider = (factor > 0) | (constant > 0)
