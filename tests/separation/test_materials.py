@@ -147,11 +147,12 @@ def test_ratio_of_a_material_hangs_on_no_reference() -> None:
 def test_pixels_of_no_material_keep_what_they_tell_alone(small: Inputs) -> None:
     """At one place they are separated again, with the same films and maps to the last bit."""
     per_pixel, capture, response = small
-    labels = xr.where(xr.DataArray(where("disc", (48, 64)), dims=("y", "x")), 0, NONE)
+    labels = xr.DataArray(np.where(where("disc", (48, 64)), 0, NONE), dims=("y", "x"))
     pooled = separation.separate(capture, response, materials=labels)
     kept = (labels == NONE).values & (per_pixel["status"] == 0).values
     assert kept.mean() > 0.3
     for name in ("object_temperature", "background_temperature", "emissivity", "reflection_ratio"):
-        assert np.array_equal(*(it[name].values[:, kept] for it in (pooled, per_pixel)))
+        assert np.array_equal(pooled[name].values[:, kept], per_pixel[name].values[:, kept])
     inside = ~kept & (pooled["status"] == 0).values
-    assert not np.array_equal(*(it["emissivity"].values[:, inside] for it in (pooled, per_pixel)))
+    of_all, alone = (result["emissivity"].values[:, inside] for result in (pooled, per_pixel))
+    assert not np.array_equal(of_all, alone)
