@@ -11,7 +11,7 @@ import xarray as xr
 from scipy.special import chdtri
 
 from dbthermal import _numbers, schema
-from dbthermal._arrays import Array, Mask, stride
+from dbthermal._arrays import Array, Mask, quotient, stride
 from dbthermal.noise import MAD
 from dbthermal.schema import Status
 
@@ -26,6 +26,9 @@ _PARAMETERS |= {"offset_renewed"}
 _PATTERN = ("offset_std", "gain_std", "centre")
 _PASSES = 2  # fits of the mean, of which the first finds the outliers
 _LEVELS = 65536  # samples of a band, about, for the levels of a capture
+# Change [standard error] and [K] of the last quarter of a movie's frames against the first from
+# which a blackbody is not settled: none of 240 simulated sweeps that are.
+_SIGMAS, _UNSETTLED = 5.0, 0.1
 _ROUNDING = 0.01  # differences between pixels that are rounding [count], or [1] of logarithms
 
 
@@ -49,7 +52,8 @@ def blackbody_statistics(movies: xr.Dataset) -> xr.Dataset:
     Dataset
         Stage `blackbody_frames`: `counts` (band, temperature, y, x) [count], and `noise` (band)
         [count], the standard deviation of one sample; attribute ``frames``, the fewest that are no
-        copies. TypeError or ValueError if the movies hold NaN or do not vary.
+        copies. TypeError or ValueError if the movies hold NaN or do not vary; a UserWarning of
+        blackbodies that were not settled, by the means of the first and the last quarter.
 
     Examples
     --------
@@ -69,9 +73,10 @@ def blackbody_statistics(movies: xr.Dataset) -> xr.Dataset:
     if frames < 2:
         raise ValueError(f"Invalid movies of {frames} frame. Must have at least 2, for the noise.")
     # Variance of one sample: half the mean square of the differences, (band, temperature, pixel).
-    variance = np.empty((*counts.shape[:2], *counts.shape[3:]))
+    variance, levels = np.empty((*counts.shape[:2], *counts.shape[3:])), np.empty(counts.shape[:3])
     for place in np.ndindex(*counts.shape[:2]):
         movie = counts[place].values.astype(np.float32)  # signed: unsigned counts wrap around
+        levels[place] = movie.mean(axis=(1, 2), dtype=float)
         change = np.diff(movie, axis=0)
         # The differences of a copy are 0 in every pixel.
         number = max(1, int(change.any(axis=(1, 2)).sum()))
@@ -87,7 +92,26 @@ def blackbody_statistics(movies: xr.Dataset) -> xr.Dataset:
             raise ValueError(f"Invalid noise {value} count of the movies in band '{band}'. {rule}.")
     means = counts.mean("frame", dtype=np.float64, skipna=False)
     variables = schema.variables("blackbody_frames", {"counts": means.values, "noise": noise})
-    return xr.Dataset(variables, means.coords, {"frames": frames, **schema.origin(movies.attrs)})
+    attrs = {"frames": frames, **schema.origin(movies.attrs)}
+    return schema.warned(xr.Dataset(variables, means.coords, attrs), *_unsettled(counts, levels))
+
+
+def _unsettled(counts: xr.DataArray, levels: Array) -> list[str]:
+    """Sentences on views whose level (band, temperature, frame) changes by more than by chance."""
+    kelvin, quarter = counts["temperature"].values, levels.shape[2] // 4
+    if quarter == 0 or np.ptp(kelvin) == 0:
+        return []
+    change = levels[..., -quarter:].mean(axis=2) - levels[..., :quarter].mean(axis=2)
+    error = np.sqrt(np.mean(np.diff(levels, axis=2) ** 2, axis=2) / quarter)
+    rate = np.ptp(levels.mean(axis=2), axis=1, keepdims=True) / np.ptp(kelvin)  # [count/K]
+    drift = np.where(abs(change) > _SIGMAS * error, quotient(change, rate, 0.0), 0.0)
+    sentences = []
+    for band, steps in zip(counts["band"].values, drift, strict=True):
+        places = np.flatnonzero(abs(steps) > _UNSETTLED)
+        changes = ", ".join(f"{steps[it]:+.2f} K at {kelvin[it]:g} K" for it in places)
+        rule = "Leave out the first frames, or state the `blackbody_accuracy`"
+        sentences += [f"A blackbody was not settled: '{band}' {changes}. {rule}."] * bool(changes)
+    return sentences
 
 
 def fit_correction(

@@ -237,8 +237,6 @@ def common_gain(emissivity: Array, covariance: Array) -> Array:
     median over the region,
 
     .. math:: \operatorname{med} (g e_i - g e_j)^2 / (v_i + v_j) = 0.455 \rho
-
-    The common deviation is NaN where the emissivities are.
     """
     finite = np.isfinite(emissivity).all(axis=0) & np.isfinite(covariance).all(axis=(0, 1))
     # Any system that can be inverted stands in for a pixel without a value.

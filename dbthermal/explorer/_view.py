@@ -30,6 +30,10 @@ class View:
     Films that are not in memory, or the small part of which a curve is asked, are copied into a
     temporary file (``TMPDIR``): 4 bytes a pixel and frame, and in memory a row of a store's chunks.
 
+    TypeError or ValueError if the data are no Dataset or path, or have neither temperature nor
+    counts, a variable is not as `schema` says, the capture has other frames, pixels or bands, or a
+    time is infinite. UserWarning if the capture states another ``source``.
+
     Parameters
     ----------
     data : Dataset, str or Path
@@ -48,13 +52,6 @@ class View:
         Time of each frame [s]; rows and columns.
     events : dict of str to float
         Name to time [s], with what segments and frame flags of the capture say.
-
-    Raises
-    ------
-    TypeError, ValueError
-        If the data are no Dataset or path, or have neither temperature nor counts; a variable is
-        not as `schema` says; the capture has other frames, pixels or bands; or a time is infinite.
-        UserWarning if the capture states another ``source``.
 
     Examples
     --------
@@ -173,6 +170,10 @@ class View:
         .. math:: s^2 = \left(\frac1n \sum_i k_i\right)^2 + \left(\frac1n \sum_i c_i\right)^2
                   + \frac1{n^2} \sum_i (s_i^2 - k_i^2 - c_i^2)
 
+        The deviations exclude the correlation of neighbours by interpolation. That of the reflected
+        temperature is mostly the prior of its drift (`SubspaceSettings.background_drift`): without
+        a drift the mean is much closer.
+
         Parameters
         ----------
         name, region : str, Region
@@ -186,12 +187,6 @@ class View:
             `mean`, `minimum`, `maximum`, `std` in the pane's units, its part `calibration_std`, and
             `pixels`, the number that counts, over (time); without it for a map. NaN where no pixel
             counts. `std` is NaN where the result states no deviation.
-
-        Notes
-        -----
-        The deviations exclude the correlation of neighbours by interpolation. That of the reflected
-        temperature is mostly the prior of its drift (`SubspaceSettings.background_drift`): without
-        a drift the mean is much closer.
         """
         if name == "status":
             raise ValueError("Invalid pane 'status'. Must be one with numbers.")

@@ -54,6 +54,12 @@ def bounds(
     2003, doi:10.1088/0266-5611/19/2/201), and in the frames at rest one number for all. Response
     and noise are known.
 
+    For the linear response and two bands, ``resting=False`` gives the reflection ratio its closed
+    form, and no emissivity: scaling :math:`1 - e_m` up and :math:`y - x` down alike changes no
+    sample. Frames at rest determine the emissivities, and sharpen the ratio; the curvature of the
+    exact response determines them without, but hardly, and the bound of the ratio is then loose. An
+    `emissivity_std` of 0.29, that of a uniform number in (0, 1), tightens it.
+
     Parameters
     ----------
     scene : Dataset
@@ -87,14 +93,6 @@ def bounds(
         TypeError or ValueError if an input is not as described, there is one band only, an
         emissivity lies outside (0, 1), a temperature outside the response's range, or no smooth
         subspace holds the object.
-
-    Notes
-    -----
-    For the linear response and two bands, ``resting=False`` gives the reflection ratio its closed
-    form, and no emissivity: scaling :math:`1 - e_m` up and :math:`y - x` down alike changes no
-    sample. Frames at rest determine the emissivities, and sharpen the ratio; the curvature of the
-    exact response determines them without, but hardly, and the bound of the ratio is then loose. An
-    `emissivity_std` of 0.29, that of a uniform number in (0, 1), tightens it.
 
     Examples
     --------

@@ -73,6 +73,9 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
     regions with their error bars, what can be trusted and why the rest cannot, emissivities beside
     those of a table, what was assumed, parameters and provenance. Its numbers are in it as JSON.
 
+    ImportError without a library of the extra `report`. TypeError or ValueError as `explorer.View`,
+    or if there is no object temperature, a region is not one, or the path has another ending.
+
     Parameters
     ----------
     data : Dataset, str or Path
@@ -94,12 +97,6 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
         From `store.provenance`, by default that of the result; degrees Celsius instead of kelvin.
     codec : {"h264", "vp9"}
         Compression of the film. H.264 plays in every browser; see `store.save_video`.
-
-    Raises
-    ------
-    ImportError, TypeError, ValueError
-        If a library of the extra `report` is not installed; as `explorer.View`; if there is no
-        object temperature, a region is not one, or the path has another ending.
 
     Examples
     --------

@@ -334,8 +334,7 @@ def _blackbody(curve: responses.Curve, temperature: xr.DataArray) -> Array:
     if "band" in temperature.dims:
         (place,) = schema.band_positions(temperature, [curve.band], str(temperature.name))
         temperature = temperature.isel(band=place)
-    values = responses.require_range(temperature.values, curve, str(temperature.name))
-    return curve.counts(values)
+    return curve.counts(responses.require_range(temperature.values, curve, str(temperature.name)))
 
 
 def observe(

@@ -108,6 +108,21 @@ def test_the_answer_and_the_author_come_first(tmp_path: Path) -> None:
     assert "construction concrete (0.0)" in page
 
 
+def test_materials_in_one_line_differ_by_its_deviation(tmp_path: Path) -> None:
+    """Two labels that are like the same material of the table widen the deviation of its line."""
+    data = scene()
+    data["emissivity"].values[1, :, 8:] += 0.03
+    deviations = []
+    for labels in (np.zeros((12, 16)), np.tile(np.arange(16) // 8, (12, 1))):
+        data["material"] = ("y", "x"), labels.astype(np.int32)
+        dbthermal.report(data, tmp_path / "scene.html")
+        (line,) = numbers((tmp_path / "scene.html").read_text("utf-8"))["answer"]["materials"]
+        deviations.append([*line["emissivity_std"].values()])
+    first, second = np.sqrt(np.diff(np.square(deviations), axis=0)[0])
+    assert first == pytest.approx(0.0, abs=1e-9)
+    assert second == pytest.approx(0.015, rel=0.01)
+
+
 def test_a_logo_is_in_the_page(tmp_path: Path) -> None:
     """A PNG stands beside the heading; any other file, or a large one, is refused by name."""
     png = b"\x89PNG\r\n\x1a\n" + b"picture"

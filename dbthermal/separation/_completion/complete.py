@@ -47,7 +47,8 @@ def complete(  # noqa: PLR0913 - all that is known beside the capture, by name
 
     Where a pixel has no value of its own, the posterior of the image formation (`mixing`) is taken
     with a prior on what the pixel cannot tell: its emissivities e, and the level c of its
-    background, about which that fluctuates by f. No prior is set on the object's temperature x.
+    background, about which that fluctuates by f. No prior is set on the object's temperature x
+    (Gelman et al. 2013, Bayesian Data Analysis, 3rd edition, doi:10.1201/b16018).
 
     .. math:: p(x, e, c, f \mid z) \propto p(z \mid x, e, c, f) \, p(e) \, p(c) \, p(f)
 
@@ -55,6 +56,14 @@ def complete(  # noqa: PLR0913 - all that is known beside the capture, by name
     if the pixel does not contradict them by three deviations; else of the `prior`, of which the
     library's lose those that would mirror less of the background's rapid changes than the pixel
     shows. Near black, the result tends to the camera's own reading.
+
+    The deviations hold the uncertainty of the model: noise is averaged over time as far as the
+    curve allows, the errors of emissivities and level are not. An error of a prior is shared by all
+    pixels that it completes.
+
+    TypeError or ValueError if an argument is not as described, an emissivity of the prior lies
+    outside (0, 1), the surroundings are not from 150 to 3000 K, as in degrees Celsius or in counts,
+    the result is of another capture, or no library has the bands, without a prior.
 
     Parameters
     ----------
@@ -90,25 +99,6 @@ def complete(  # noqa: PLR0913 - all that is known beside the capture, by name
         number); a sample that a pixel alone lacks is bridged from those around it: `bridged`
         (time, y, x) says which, and leaves no bit (`frames_bridged`, their mean number).
         Attributes `surroundings`, `surroundings_std` [K], `surroundings_source` ("assumed": 22 C).
-
-    Raises
-    ------
-    TypeError
-        If an argument is of the wrong type.
-    ValueError
-        If a dim, unit, band or coordinate is not as described, an emissivity of the prior lies
-        outside (0, 1), the surroundings are not from 150 to 3000 K, as in degrees Celsius or in
-        counts, the result is of another capture, or no library has the bands, without a prior.
-
-    Notes
-    -----
-    The deviations hold the uncertainty of the model: noise is averaged over time as far as the
-    curve allows, the errors of emissivities and level are not. An error of a prior is shared by all
-    pixels that it completes.
-
-    References
-    ----------
-    .. [1] Gelman et al. (2013), Bayesian Data Analysis, 3rd edition, doi:10.1201/b16018
 
     Examples
     --------
