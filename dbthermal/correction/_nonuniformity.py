@@ -108,9 +108,9 @@ def _unsettled(counts: xr.DataArray, levels: Array) -> list[str]:
     sentences = []
     for band, steps in zip(counts["band"].values, drift, strict=True):
         places = np.flatnonzero(abs(steps) > _UNSETTLED)
-        changes = ", ".join(f"{steps[it]:+.2f} K at {kelvin[it]:g} K" for it in places)
-        rule = "Leave out the first frames, or state the `blackbody_accuracy`"
-        sentences += [f"A blackbody was not settled: '{band}' {changes}. {rule}."] * bool(changes)
+        if changes := ", ".join(f"{steps[it]:+.2f} K at {kelvin[it]:g} K" for it in places):
+            rule = "Leave out the first frames, or state the `blackbody_accuracy`"
+            sentences.append(f"A blackbody was not settled: band '{band}' {changes}. {rule}.")
     return sentences
 
 

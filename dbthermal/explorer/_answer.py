@@ -130,8 +130,7 @@ def by_material(result: xr.Dataset, measured: Mask, table: xr.Dataset) -> list[d
     for pixels in (pixels for pixels in groups if pixels.sum() >= max(1, _COMMON * len(values))):
         medians = [np.median(array[pixels], axis=0) for array in (values, stds, steady_stds)]
         # Labels of a group may differ by more than its deviation says.
-        labelled = pixels & (labels >= 0)
-        if labelled.any():
+        if (labelled := pixels & (labels >= 0)).any():
             medians[1:] = [np.hypot(std, judged[labelled].std(axis=0)) for std in medians[1:]]
         entry: dict[str, Any] = {"pixels": int(pixels.sum()), "nearest": []}
         for key, numbers in zip(_EMISSIVITIES, medians, strict=True):

@@ -35,8 +35,8 @@ def ecostress(path: str | Path) -> xr.Dataset:
 
     The file gives the hemispherical reflectance R [%] of an opaque sample, so that by Kirchhoff's
     law its emissivity is 1 - R / 100. Header and values are compared: units, kind of measurement,
-    number of values, first and last wavelength (Meerdink et al. 2019, The ECOSTRESS spectral library
-    version 1.0, Remote Sensing of Environment 230, 111196, doi:10.1016/j.rse.2019.05.015).
+    number of values, first and last wavelength (Meerdink et al. 2019, Remote Sensing of Environment
+    230, 111196, doi:10.1016/j.rse.2019.05.015).
 
     OSError or ValueError if it cannot be opened, is not as long as declared, is no hemispherical
     reflectance [%] over micrometres, has an emissivity outside `schema.EMISSIVITY_LIMITS`, or a

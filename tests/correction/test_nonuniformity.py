@@ -296,7 +296,7 @@ def test_drift_is_no_noise(movies: xr.Dataset) -> None:
     """A drift of 200 counts over the movie is warned of, and does not enter the noise."""
     drift = xr.DataArray(np.linspace(0.0, 200.0, 12).round().astype(np.uint16), dims="frame")
     drifting = movies + drift
-    with pytest.warns(UserWarning, match="not settled: '[89].+' .[0-9.]+ K at") as notes:
+    with pytest.warns(UserWarning, match="not settled: band '[89].+' .[0-9.]+ K at") as notes:
         noise = blackbody_statistics(drifting.transpose(*movies["counts"].dims))["noise"]
     assert len(notes) == 2  # of each band
     assert float(noise[1]) == pytest.approx(60.0, rel=0.04)
