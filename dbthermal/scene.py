@@ -52,7 +52,7 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
     3. `separation.separate`.
 
     Clocks and shift of a large capture are estimated from means over some pixels and frames.
-    Errors as the steps.
+    Errors and warnings as the steps.
 
     Parameters
     ----------
@@ -81,11 +81,6 @@ def separate_capture(  # noqa: PLR0913 - the options of each step, by name
         (axis, y, x) [pixel] where the cameras see reflections apart. Attributes of the alignment:
         `clock`, `time_offset` and `time_offset_std` [s], `frames_lost`, `transform`. From a
         `target` it is lazy.
-
-    Warns
-    -----
-    UserWarning
-        As the steps.
 
     Examples
     --------

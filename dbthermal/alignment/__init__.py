@@ -44,7 +44,9 @@ def align(
 
     TypeError or ValueError if an argument is not as described, no offset is found, one leaves no
     frame that all bands have, or a band's clock was set while it ran: its stamps step, and the
-    images go on as without the step.
+    images go on as without the step. A UserWarning if the clocks of cameras apart still seem to be
+    off by more than a tenth of a frame, or the images contradict an offset that was stated to
+    `readers.two_bands`, and are followed.
 
     Parameters
     ----------
@@ -86,12 +88,6 @@ def align(
         `time_offset_std` [s] where the images tell it, `frames_lost` (of each band), `pauses`
         (times of the frames before and after each gap of more than 20 frame periods, in turn) [s],
         `transform` (the matrices, row by row). Other variables over `time` are dropped.
-
-    Warns
-    -----
-    UserWarning
-        If the clocks of cameras apart seem to be off by more than a tenth of a frame still; if the
-        images contradict an offset that was stated to `readers.two_bands`, and are followed.
 
     Examples
     --------

@@ -72,6 +72,8 @@ def tiff(
     ValueError if the unit is another one; a file is damaged, or holds two bands or other axes; a
     page has no 16-bit counts, or they are missing, scaled, mirrored, rotated, inverted, compressed
     with loss or of another size; they take too much memory or have 8 bits; or the clock is wrong.
+    UserWarning if dates or a description have another rate, numbers or dates leave files out,
+    stacks before the last differ in length, a frame is there twice, or another axis may be time.
 
     Parameters
     ----------
@@ -93,12 +95,6 @@ def tiff(
     Dataset
         `counts` (time, y, x) [count], uint16, `exposure_time` and `frame_flags` (time), as from
         `flir`; attributes ``source``, ``format``, ``byte_order``.
-
-    Warns
-    -----
-    UserWarning
-        If dates or a description have another rate, numbers or dates leave files out, stacks before
-        the last differ in length, a frame is there twice, or another axis seems to be time.
 
     Examples
     --------

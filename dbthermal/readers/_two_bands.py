@@ -33,7 +33,8 @@ def two_bands(
 
     TypeError or ValueError if a recording is not one of counts in one band, or its times are
     unknown or fall; bands are not different names, one for each; sizes differ; there is no offset
-    and no date; or recordings do not overlap in time, or hold the same counts.
+    and no date; or recordings do not overlap in time, or hold the same counts. A UserWarning if the
+    counts of all bands read as the same temperatures, in hundredths or tenths.
 
     Parameters
     ----------
@@ -52,11 +53,6 @@ def two_bands(
         (band, time). Shorter bands are filled with their last frame, flagged ``padded``, without a
         time; `time` is the clock of the longest one. ``files`` has all recordings' attributes as a
         mapping by band. Copies the counts: twice their memory is needed.
-
-    Warns
-    -----
-    UserWarning
-        If the counts of all bands read as the same temperatures, in hundredths or tenths.
 
     Examples
     --------

@@ -65,9 +65,15 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     r"""Separate emission and reflection in a capture of two bands or more.
 
     Of the image formation (`mixing`) with the responses U of `response`, object temperature x,
-    background temperature y and emissivities e are estimated:
+    background temperature y and emissivities e are estimated (Narayanan, Ramanagopal, Narasimhan
+    2026, Dual Band Thermal Videography, CVPR, doi:10.48550/arXiv.2509.11334):
 
     .. math:: I_m(t) = e_m U_m(x(t)) + (1 - e_m) U_m(y(t)) + \mathrm{noise}
+
+    TypeError or ValueError if an argument is not as described, the counts are whole numbers, which
+    are raw, the settings are those of another method, the capture is too short for the method, or
+    its `time` is that of arrival or of a clock that was set: "subspace" finds slow changes smooth
+    over the numbers of the frames and not over the times. A bad pixel is a bit of `status`.
 
     Parameters
     ----------
@@ -129,16 +135,6 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
         invalid or masked samples, and where a method never estimates them (attribute
         `not_estimated`); where the status is 0, all others are finite.
 
-    Raises
-    ------
-    TypeError
-        If an argument is of the wrong type, the counts are whole numbers, which are raw, or the
-        settings are those of another method.
-    ValueError
-        If a dim, unit, band, coordinate, method or emissivity is not as described, the capture is
-        too short for the method, or its `time` is that of arrival or of a clock that was set:
-        "subspace" finds slow changes smooth over the numbers of the frames and not over the times.
-        A bad pixel is not an error but a bit of `status`.
 
     Notes
     -----
@@ -160,11 +156,6 @@ def solve(  # noqa: PLR0913 - the one entrance; all but the first three are by n
     alike, give ratios as certain as neighbours agree on them; with these the object is solved for
     all pixels together, and each pixel once more with the resulting x(p). A pixel whose reflection
     the second camera does not see has the bit `no_reflection_pair`.
-
-    References
-    ----------
-    .. [1] Narayanan, Ramanagopal, Narasimhan (2026), Dual Band Thermal Videography, CVPR;
-       doi:10.48550/arXiv.2509.11334
     """
     require_whole("number of workers", workers, 1)
     require_whole("seed", seed, 0)

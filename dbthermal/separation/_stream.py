@@ -50,6 +50,10 @@ class Stream:
     TypeError or ValueError as from `solve`; if the bands are not two, the response has no noise, or
     a number is not positive.
 
+    With weights :math:`a_i` of the means in the parabola, the object's variance is that through
+    the ratio, as in `solve`, and :math:`\sum_i a_i^2 \, \mathrm{var}(q_i) / h'^2`. A change of the
+    reflection must last longer than a sample of the history, saturated or frozen samples for three.
+
     Parameters
     ----------
     template : Dataset
@@ -77,12 +81,6 @@ class Stream:
         Names of the bands, as in the template.
     lost_frames : int
         Frames that did not come, by the times of the others, or were of no use.
-
-    Notes
-    -----
-    With weights :math:`a_i` of the means in the parabola, the object's variance is that through
-    the ratio, as in `solve`, and :math:`\sum_i a_i^2 \, \mathrm{var}(q_i) / h'^2`. A change of the
-    reflection must last longer than a sample of the history, saturated or frozen samples for three.
 
     Examples
     --------

@@ -81,6 +81,16 @@ def materials(
     ImportError without scikit-image (extra "materials"), ValueError if a rate is not in (0, 1), a
     variable is missing, or bands, sizes or coordinates differ.
 
+    Two regions are compared by the pooled ratio of each band, an inverse-variance mean, and by the
+    emissivity of the reference band. The error of an emissivity is one that neighbours share (the
+    background's slow part), so its mean is taken to be no surer than that of one pixel. The
+    deviations of the ratios of several bands are taken as independent, and those of pixels, but as
+    many as an attribute `pixels` of their deviation says, which share one.
+
+    Borders are found within 2 pixels. A pixel beside another material stays with its own if its own
+    ratio tells the two apart, by three standard deviations; else, and where nothing moved and the
+    object hardly changed, it belongs to none.
+
     Parameters
     ----------
     result : Dataset
@@ -104,18 +114,6 @@ def materials(
         `material` (y, x), int32: connected regions from 0, the largest first, less what at their
         borders may be of the neighbour; -1 for that, for pixels without a signal, for regions in
         which no pixel has a ratio and that no neighbour takes in, or of less than 16 pixels.
-
-    Notes
-    -----
-    Two regions are compared by the pooled ratio of each band, an inverse-variance mean, and by the
-    emissivity of the reference band. The error of an emissivity is one that neighbours share (the
-    background's slow part), so its mean is taken to be no surer than that of one pixel. The
-    deviations of the ratios of several bands are taken as independent, and those of pixels, but as
-    many as an attribute `pixels` of their deviation says, which share one.
-
-    Borders are found within 2 pixels. A pixel beside another material stays with its own if its own
-    ratio tells the two apart, by three standard deviations; else, and where nothing moved and the
-    object hardly changed, it belongs to none.
 
     Examples
     --------
