@@ -1,5 +1,6 @@
 """Registration of several views of one object, by robust least squares between smooth curves."""
 
+from functools import partial
 from itertools import product
 from typing import Final, Literal
 
@@ -21,10 +22,10 @@ _FREE: Final = {"translation": [2, 5], "affine": [0, 1, 2, 3, 4, 5], "homography
 _MODELS: Final = tuple(_FREE)
 # Blurs from coarse to fine, as shares of the image's height, and the finest [pixel].
 _BLURS, _FINEST = (0.08, 0.04, 0.02), 0.7
-# Detail: its blur [pixel], windows' side [pixel] and most; squared correlation, and share of the
-# displacements that correlate by 0.9 of the best: of 16 smooth objects of two to four materials 0.4
-# to 0.9 and at most 0.1; of other objects at most 0.25; of a warm spot 0.56 of them or more.
-_DETAIL, _SIDE, _WINDOWS, _ALIKE, _WIDE = 1.0, 11, 64, 0.3, 0.2
+# Detail: between two blurs [pixel], windows' side [pixel] and number; limits of squared correlation
+# (16 objects of two to four materials 0.44 to 0.87, 50 pairs of unlike objects up to 0.30), and of
+# the share of displacements that correlate by 0.9 of the best (objects 0.1, a warm spot 0.56).
+_DETAIL, _SMOOTH, _SIDE, _WINDOWS, _ALIKE, _WIDE = 1.0, 3.0, 11, 64, 0.35, 0.2
 _NEARLY: Final = 0.98  # of the best, which a lesser displacement may reach along an edge
 _SMALLEST: Final = 16  # rows and columns, at least
 # A pixel farther from the median around it is bad: window [pixel], limit [standard deviation].
@@ -55,11 +56,10 @@ def register(
 
     .. math:: \min \sum_p \varrho \left(\sum_t [f(I_1(p, t)) - I_2(H p, t)]^2 \right)
 
-    with Tukey's bisquare :math:`\varrho`, which excludes pixels with different reflections, and an
-    f that is linear in the window around a pixel. Where a smooth object has no detail, its shape
-    tells H, from coarse to fine images, with one quadratic f for all pixels. A weak prior of equal
-    cameras that look one way (rotation, scale and perspective within 1 %, one standard deviation)
-    counts where the texture does not tell them. H takes positions to positions:
+    with Tukey's bisquare :math:`\varrho`, which excludes pixels with different reflections, of the
+    images' detail, and an f that is linear in the window around a pixel. Without detail the shape
+    of an object tells H, with one quadratic f for all pixels. A weak prior of equal cameras that
+    look one way (rotation, scale, perspective within 1 %) counts too. H takes place to place:
 
     .. math:: (x', y', 1)^T \propto H (x, y, 1)^T
 
@@ -171,15 +171,16 @@ def _transform(first: Array, second: Array, model: str, band: str) -> Array:
     allowed, number = _MODELS[: _MODELS.index(model) + 1], min(len(first), len(second))
     first, second = first[:number], second[:number]
     # By detail, whose contrast differs from border to border, if both views show some.
-    pair = [gaussian_filter(images, _DETAIL, axes=(1, 2)) for images in (first, second)]
-    if (matrix := _start_of_detail(pair)) is not None:
+    blurred = partial(gaussian_filter, axes=(1, 2))
+    pair = [blurred(images, _DETAIL) - blurred(images, _SMOOTH) for images in (first, second)]
+    if (matrix := _start_of_detail(*pair)) is not None:
         for kind in allowed:
             matrix = _fitted(pair, matrix, _FREE[kind], _DETAIL, band)
         return matrix
     # Else by the shape of a smooth object, whose coarse images have little perspective.
     matrix, coarse = np.eye(3), [(share * first.shape[1], allowed[:1]) for share in _BLURS]
     for blur, models in [*coarse, (coarse[-1][0], allowed[1:2]), (_FINEST, allowed)]:
-        pair = [gaussian_filter(images, blur, axes=(1, 2)) for images in (first, second)]
+        pair = [blurred(images, blur) for images in (first, second)]
         for kind in models:
             matrix = _fitted(pair, matrix, _FREE[kind], blur, band)
     # The images must be alike where they overlap.
@@ -197,9 +198,8 @@ def _transform(first: Array, second: Array, model: str, band: str) -> Array:
     return matrix
 
 
-def _start_of_detail(pair: list[Array]) -> Array | None:
+def _start_of_detail(first: Array, second: Array) -> Array | None:
     """Translation (3, 3) at which windows of images (time, y, x) correlate; None without detail."""
-    first, second = (it - gaussian_filter(it, 3.0 * _DETAIL, axes=(1, 2)) for it in pair)
     reach = min(first.shape[1:]) // 10
     ends = (range(reach, size - reach - _SIDE + 1, _SIDE) for size in first.shape[1:])
     places = [(slice(y, y + _SIDE), slice(x, x + _SIDE)) for y, x in product(*ends)]
@@ -254,13 +254,13 @@ def _fitted(pair: list[Array], matrix: Array, free: list[int], blur: float, band
         overlap = _overlap(places, band)
         reference = pair[0][:, overlap]
         values, *slopes = white @ sampled(splines, places[:, overlap]).swapaxes(1, 2)
-        # I_2(H p) + (dH p) grad I_2 = f(I_1) + o, linear in dH and the numbers of f and o.
+        # I_2(H p) + (dH p) grad I_2 = f(I_1), linear in dH and the numbers of f.
         motion = _motion(matrix, places, overlap)[rows, columns] * unit[:, np.newaxis, np.newaxis]
         design = -np.einsum("atp,nap->ntp", slopes, motion)
-        if blur == _DETAIL:  # beside what is linear in windows
+        if blur == _DETAIL:
             films = _beside([values, *design], white @ reference, overlap)
             values, design = films[0], films[1:]
-        else:  # beside one function of the whole image
+        else:  # one f for the whole image, a constant for each time
             powers = np.matmul(white, [reference**power for power in range(1, _DEGREE + 1)])
             constants = np.repeat(white.T[:, :, np.newaxis], reference.shape[1], axis=2)
             design = np.concatenate([design, powers, constants])
