@@ -1,16 +1,14 @@
 """Registration of several views of one object, by robust least squares between smooth curves."""
 
-from functools import partial
-from itertools import product
+from operator import itemgetter
 from typing import Final, Literal
 
 import numpy as np
 import xarray as xr
-from scipy.ndimage import gaussian_filter, median_filter, spline_filter, uniform_filter
-from scipy.signal import correlate
+from scipy.ndimage import gaussian_filter, median_filter, spline_filter
 
 from dbthermal import _text, schema
-from dbthermal._arrays import Array, Mask, quotient
+from dbthermal._arrays import Array, Mask
 from dbthermal._smooth import polynomial_basis
 from dbthermal.alignment import _clocks as clocks
 from dbthermal.alignment._resampling import TRANSFORM, positions
@@ -22,11 +20,6 @@ _FREE: Final = {"translation": [2, 5], "affine": [0, 1, 2, 3, 4, 5], "homography
 _MODELS: Final = tuple(_FREE)
 # Blurs from coarse to fine, as shares of the image's height, and the finest [pixel].
 _BLURS, _FINEST = (0.08, 0.04, 0.02), 0.7
-# Detail: between two blurs [pixel], windows' side [pixel] and number; limits of squared correlation
-# (16 objects of two to four materials 0.44 to 0.87, 50 pairs of unlike objects up to 0.30), and of
-# the share of displacements that correlate by 0.9 of the best (objects 0.1, a warm spot 0.56).
-_DETAIL, _SMOOTH, _SIDE, _WINDOWS, _ALIKE, _WIDE = 1.0, 3.0, 11, 64, 0.35, 0.2
-_NEARLY: Final = 0.98  # of the best, which a lesser displacement may reach along an edge
 _SMALLEST: Final = 16  # rows and columns, at least
 # A pixel farther from the median around it is bad: window [pixel], limit [standard deviation].
 _MEDIAN_WINDOW, _OUTLYING = 3, 6.0
@@ -50,16 +43,15 @@ def register(
     r"""Estimate the transform from the pixels of the first view to those of the others.
 
     Smooth curves are fitted robustly to each pixel, so that passing reflections hardly count. The
-    displacement at which windows of both views have most detail in common, whatever its contrast in
-    each band, is refined by robust least squares of the curves (Baker, Matthews 2004, International
-    Journal of Computer Vision 56, 221, doi:10.1023/B:VISI.0000011205.11775.fd),
+    translation between their means, from coarse to fine images, is refined to some hundredths of a
+    pixel by robust least squares of the curves [1]_,
 
-    .. math:: \min \sum_p \varrho \left(\sum_t [f(I_1(p, t)) - I_2(H p, t)]^2 \right)
+    .. math:: \min \sum_p \varrho \left(\sum_t [f(I_1(p, t)) + o(t) - I_2(H p, t)]^2 \right)
 
-    with Tukey's bisquare :math:`\varrho`, which excludes pixels with different reflections, of the
-    images' detail, and an f that is linear in the window around a pixel. Without detail the shape
-    of an object tells H, with one quadratic f for all pixels. A weak prior of equal cameras that
-    look one way (rotation, scale, perspective within 1 %) counts too. H takes place to place:
+    with Tukey's bisquare :math:`\varrho`, which excludes pixels with different reflections, and a
+    quadratic :math:`f`, because the bands' radiances are not proportional. A weak prior of equal
+    cameras that look one way (rotation, scale and perspective within 1 %, one standard deviation)
+    counts where the texture does not tell them. H takes positions to positions:
 
     .. math:: (x', y', 1)^T \propto H (x, y, 1)^T
 
@@ -67,7 +59,7 @@ def register(
     places of the plane: no transform brings object and reflection together.
 
     TypeError or ValueError if the image is smaller than 16 pixels either way, a mean is not finite,
-    the views of a smooth object correlate by less than 0.5, or share less than half the image.
+    the correlation of two views is below 0.5, or they share less than half the image.
 
     Parameters
     ----------
@@ -75,8 +67,9 @@ def register(
         Stage `corrected` of `schema`: views of one object, displaced by at most about a tenth of
         the image. Of a capture with a `segment` the longest is used.
     model : {"translation", "affine", "homography"}
-        Kind of transform. An affine one fits cameras that look the same way. Straight edges in one
-        direction tell none along them: there the least displacement is taken.
+        Kind of transform. Where a smooth object's materials differ from band to band in contrast,
+        nothing else has detail, and people walk by, each may be off by 30 pixels: take one of
+        another object, such as a target. An affine one fits cameras that look the same way.
 
     Returns
     -------
@@ -84,6 +77,11 @@ def register(
         (band, row, column) [1], for `align`: for each band H, which takes the homogeneous position
         (x, y, 1) of a pixel of the first view to that of the same point in this one. Pixels count
         from 0 at the centre of the first; the identity in the first band. Attribute: `model`.
+
+    References
+    ----------
+    .. [1] Baker, Matthews (2004), International Journal of Computer Vision 56, 221,
+       doi:10.1023/B:VISI.0000011205.11775.fd
 
     Examples
     --------
@@ -168,73 +166,23 @@ def _smooth(signal: Array) -> Array:
 
 def _transform(first: Array, second: Array, model: str, band: str) -> Array:
     """Homography (3, 3) from images (time, y, x) of the first view to those of the second."""
-    allowed, number = _MODELS[: _MODELS.index(model) + 1], min(len(first), len(second))
-    first, second = first[:number], second[:number]
-    # By detail, whose contrast differs from border to border, if both views show some.
-    blurred = partial(gaussian_filter, axes=(1, 2))
-    pair = [blurred(images, _DETAIL) - blurred(images, _SMOOTH) for images in (first, second)]
-    if (matrix := _start_of_detail(*pair)) is not None:
-        for kind in allowed:
-            matrix = _fitted(pair, matrix, _FREE[kind], _DETAIL, band)
-        return matrix
-    # Else by the shape of a smooth object, whose coarse images have little perspective.
-    matrix, coarse = np.eye(3), [(share * first.shape[1], allowed[:1]) for share in _BLURS]
-    for blur, models in [*coarse, (coarse[-1][0], allowed[1:2]), (_FINEST, allowed)]:
-        pair = [blurred(images, blur) for images in (first, second)]
+    starts, failures = [], []
+    # Start from the mean or, of a heated object, from the rise: whichever correlates better.
+    for weights in (np.ones(len(first)), np.linspace(-1.0, 1.0, len(first))):
+        try:
+            pair = [np.tensordot(weights, images, axes=1) for images in (first, second)]
+            starts.append(_start(pair, band))
+        except ValueError as error:
+            failures.append(error)
+    if not starts:
+        raise failures[0]
+    matrix, allowed = max(starts, key=itemgetter(0))[1], _MODELS[: _MODELS.index(model) + 1]
+    # The coarse images have little perspective.
+    for blur, models in ((_BLURS[-1] * first.shape[1], allowed[:2]), (_FINEST, allowed)):
+        pair = [gaussian_filter(images, blur, axes=(1, 2)) for images in (first, second)]
         for kind in models:
             matrix = _fitted(pair, matrix, _FREE[kind], blur, band)
-    # The images must be alike where they overlap.
-    places = positions(matrix, first.shape[1:])
-    overlap, images = _overlap(places, band), [images.mean(axis=0) for images in pair]
-    values = sampled(spline_filter(images[1])[..., np.newaxis], places[:, overlap])[0]
-    with np.errstate(invalid="ignore", divide="ignore"):  # of an image without detail
-        correlation = float(np.corrcoef(images[0][overlap], values.ravel())[0, 1])
-    if not correlation >= _LEAST_CORRELATION:
-        raise ValueError(
-            f"Invalid view in band '{band}': its correlation with the first is {correlation:.2f}. "
-            f"Must be at least {_LEAST_CORRELATION}: the same object, neither mirrored nor turned, "
-            "displaced by at most a tenth of the image."
-        )
     return matrix
-
-
-def _start_of_detail(first: Array, second: Array) -> Array | None:
-    """Translation (3, 3) at which windows of images (time, y, x) correlate; None without detail."""
-    reach = min(first.shape[1:]) // 10
-    ends = (range(reach, size - reach - _SIDE + 1, _SIDE) for size in first.shape[1:])
-    places = [(slice(y, y + _SIDE), slice(x, x + _SIDE)) for y, x in product(*ends)]
-    energy = [np.sum(first[:, *place] ** 2) for place in places]
-    agreement = np.zeros((2 * reach + 1,) * 2)
-    strongest = np.argsort(energy)[-_WINDOWS:]
-    # Squared correlation of each window at all displacements, weighted by its energy.
-    for place in (places[it] for it in strongest):
-        patch = second[:, *(slice(it.start - reach, it.stop + reach) for it in place)]
-        common = correlate(patch, first[:, *place], "valid")[0]
-        power = correlate(patch**2, np.ones_like(first[:, *place]), "valid")[0]
-        agreement += quotient(common**2, np.maximum(power, 0.0), 0.0)
-    agreement /= sum(energy[it] for it in strongest)
-    best = agreement.max()
-    if best < _ALIKE or np.mean(agreement > 0.9 * best) > _WIDE:
-        return None
-    # The least displacement that is nearly as good: along an edge all are alike.
-    trials, matrix = np.argwhere(agreement >= _NEARLY * best) - reach, np.eye(3)
-    matrix[1::-1, 2] = trials[np.argmin(np.sum(trials**2, axis=1))]
-    return matrix
-
-
-def _beside(films: list[Array], reference: Array, mask: Mask) -> Array:
-    """What films (time, pixel) hold beside a linear function of a reference in windows."""
-
-    def mean(values: Array) -> Array:
-        image = np.zeros((*values.shape[:-1], *mask.shape))
-        image[..., mask] = values
-        return np.asarray(uniform_filter(image, _SIDE, axes=(-2, -1))[..., mask])
-
-    share = mean(np.ones(reference.shape[1]))
-    level = reference - mean(reference) / share
-    remainder = np.array(films) - mean(np.array(films)) / share
-    slope = quotient(mean(remainder * level), mean(level**2), 0.0)
-    return np.asarray(remainder - slope * level)
 
 
 def _fitted(pair: list[Array], matrix: Array, free: list[int], blur: float, band: str) -> Array:
@@ -254,16 +202,15 @@ def _fitted(pair: list[Array], matrix: Array, free: list[int], blur: float, band
         overlap = _overlap(places, band)
         reference = pair[0][:, overlap]
         values, *slopes = white @ sampled(splines, places[:, overlap]).swapaxes(1, 2)
-        # I_2(H p) + (dH p) grad I_2 = f(I_1), linear in dH and the numbers of f.
+        # I_2(H p) + (dH p) grad I_2 = f(I_1) + o, linear in dH and the numbers of f and o.
         motion = _motion(matrix, places, overlap)[rows, columns] * unit[:, np.newaxis, np.newaxis]
-        design = -np.einsum("atp,nap->ntp", slopes, motion)
-        if blur == _DETAIL:
-            films = _beside([values, *design], white @ reference, overlap)
-            values, design = films[0], films[1:]
-        else:  # one f for the whole image, a constant for each time
-            powers = np.matmul(white, [reference**power for power in range(1, _DEGREE + 1)])
-            constants = np.repeat(white.T[:, :, np.newaxis], reference.shape[1], axis=2)
-            design = np.concatenate([design, powers, constants])
+        design = np.concatenate(
+            [
+                -np.einsum("atp,nap->ntp", slopes, motion),
+                np.matmul(white, [reference**power for power in range(1, _DEGREE + 1)]),
+                np.repeat(white.T[:, :, np.newaxis], reference.shape[1], axis=2),
+            ]
+        )
         weighted = design * weights[overlap]
         flat = weighted.reshape(len(design), -1)
         normal, right = flat @ design.reshape(len(design), -1).T, flat @ values.ravel()
@@ -312,3 +259,26 @@ def _overlap(places: Array, band: str) -> Mask:
     pixels = np.indices(places.shape[1:])
     lowest, highest = np.minimum(places, pixels), np.maximum(places, pixels)
     return np.asarray(np.all((lowest >= _MARGIN) & (highest <= ends - _MARGIN), axis=0))
+
+
+def _start(pair: list[Array], band: str) -> tuple[float, Array]:
+    """Correlation of two images (y, x), and the translation (3, 3) between them, coarse to fine."""
+    matrix, blurred = np.eye(3), pair
+    for share in _BLURS:
+        blur = share * len(pair[0])
+        blurred = [gaussian_filter(image, blur) for image in pair]
+        films = [image[np.newaxis] for image in blurred]
+        matrix = _fitted(films, matrix, _FREE["translation"], blur, band)
+    # The images must be alike where they overlap.
+    places = positions(matrix, pair[0].shape)
+    overlap = _overlap(places, band)
+    values = sampled(spline_filter(blurred[1])[..., np.newaxis], places[:, overlap])[0]
+    with np.errstate(invalid="ignore", divide="ignore"):  # of an image without detail
+        correlation = float(np.corrcoef(blurred[0][overlap], values.ravel())[0, 1])
+    if not correlation >= _LEAST_CORRELATION:
+        raise ValueError(
+            f"Invalid view in band '{band}': its correlation with the first is {correlation:.2f}. "
+            f"Must be at least {_LEAST_CORRELATION}: the same object, neither mirrored nor turned, "
+            "displaced by at most a tenth of the image."
+        )
+    return correlation, matrix
