@@ -68,7 +68,7 @@ def register(
         the image. Of a capture with a `segment` the longest is used.
     model : {"translation", "affine", "homography"}
         Kind of transform. Where a smooth object's materials differ from band to band in contrast,
-        nothing else has detail, and people walk by, each may be off by 30 pixels: take one of
+        nothing else has detail, and people walk by, each may be off by 12 pixels: take one of
         another object, such as a target. An affine one fits cameras that look the same way.
 
     Returns
