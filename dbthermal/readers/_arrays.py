@@ -243,8 +243,8 @@ def _times_of(arrays: dict[str, Any], name: str, path: Path) -> dict[str, Any]:
     # Times in its group, and below the outermost group that has no other film.
     films = [key for key, array in arrays.items() if array.ndim == 3 and key != name]
     groups = ["", *(name[: n + 1] for n, letter in enumerate(name) if letter == "/")]
-    around = next((it for it in groups if not any(key.startswith(it) for key in films)), name)
-    near = {n: it for (place, n), it in lines.items() if f"{place}/".startswith(around)}
+    parent = next((it for it in groups if not any(key.startswith(it) for key in films)), name)
+    near = {n: it for (place, n), it in lines.items() if f"{place}/".startswith(parent)}
     near |= {key: array for (place, key), array in lines.items() if place == group}
     fitting = {n: it for n, it in near.items() if it.size == frames and _may_be_times(n, it)}
     named = {n: it for n, it in near.items() if _TIMES.fullmatch(n) and it.size > 1}

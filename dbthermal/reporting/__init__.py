@@ -159,7 +159,6 @@ def report(  # noqa: PLR0913 - what is shown beside the result, by name
         meanings={bit.label: bit.meaning for bit in Status},
         percent=drawing.percent,
         causes=schema.CAUSES,
-        described=bool(numbers["answer"]["materials"] or (regions and bands)),
         named=bool(regions),
         bands=[drawing.band_label(band) for band in bands],
         spread=SPREAD,

@@ -369,13 +369,13 @@ def _write(
             blank = cut.status if name == "status" else np.nan
             values = np.full((*array.shape[:-2], row.size), blank, array.dtype)
             for frames, pixels, estimate in estimates:
-                part = getattr(estimate, name)
+                source = getattr(estimate, name)
                 if name == "status":
-                    values[pixels] |= part
+                    values[pixels] |= source
                 elif is_film:
-                    _place(values, np.flatnonzero(frames), np.flatnonzero(pixels), part)
-                elif part is not None:
-                    values[..., pixels] = part[np.ix_(*[order] * (part.ndim - 1))]
+                    _place(values, np.flatnonzero(frames), np.flatnonzero(pixels), source)
+                elif source is not None:
+                    values[..., pixels] = source[np.ix_(*[order] * (source.ndim - 1))]
         if is_film and not cut.valid.all():
             values = np.where(cut.valid, values, np.nan)
         if row.size == np.prod(shape):

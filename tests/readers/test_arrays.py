@@ -241,8 +241,8 @@ def test_further_names_of_times(tmp_path: Path, name: str) -> None:
         read(hdf5(path, **{name: times}))
     both = hdf5(path, **{name: times, "time": [0.0, 0.1, 0.2]})
     assert_allclose(read(both, clock=None).time, [0, 0.1, 0.2])
-    for other in ({name: np.arange(9.0)}, {name: [30.0, 30.1, 30.0]}, {"int_time": [0.01] * 3}):
-        assert not read(hdf5(path, **other)).attrs.get("warnings")
+    for arrays in ({name: np.arange(9.0)}, {name: [30.0, 30.1, 30.0]}, {"int_time": [0.01] * 3}):
+        assert not read(hdf5(path, **arrays)).attrs.get("warnings")
 
 
 def test_dates_as_a_clock() -> None:

@@ -153,6 +153,6 @@ def test_pixels_of_no_material_keep_what_they_tell_alone(small: Inputs) -> None:
     assert kept.mean() > 0.3
     for name in ("object_temperature", "background_temperature", "emissivity", "reflection_ratio"):
         assert np.array_equal(pooled[name].values[:, kept], per_pixel[name].values[:, kept])
-    inside = ~kept & (pooled["status"] == 0).values
-    of_all, alone = (result["emissivity"].values[:, inside] for result in (pooled, per_pixel))
-    assert not np.array_equal(of_all, alone)
+    labelled = ~kept & (pooled["status"] == 0).values
+    shared, single = (result["emissivity"].values[:, labelled] for result in (pooled, per_pixel))
+    assert not np.array_equal(shared, single)

@@ -204,7 +204,7 @@ def joined(
     variance = ratio_variance(pooled.ratio, pooled.inverse_energy + pooled.spread, noise)
     emissivity = pooled.emissivity, pooled.noise_variance + pooled.drift_variance
     arrays = pooled.ratio[1:], variance[1:], *emissivity
-    features = _both(*(array.reshape(-1, *cells.shape) for array in arrays))
+    features = _joint(*(array.reshape(-1, *cells.shape) for array in arrays))
     merged = Regions(cells, replace(features, common=np.ones_like(features.common)), _ERROR_RATE)
     pairs = segmentation.neighbours(cells)
     # A material is cut where ratios of single pixels are biased by what their order leaves of the
@@ -268,11 +268,11 @@ def _features(result: xr.Dataset, bands: list[int]) -> tuple[Features, Features]
     ratio, ratio_std, emissivity, emissivity_std = (
         result[name].values[bands].astype(np.float64) for name in _VARIABLES[1:5]
     )
-    features = _both(ratio[1:], ratio_std[1:] ** 2, emissivity[:1], emissivity_std[:1] ** 2)
+    features = _joint(ratio[1:], ratio_std[1:] ** 2, emissivity[:1], emissivity_std[:1] ** 2)
     return Features(*(array[:-1] for array in vars(features).values())), features
 
 
-def _both(ratio: Array, variance: Array, emissivity: Array, of_emissivity: Array) -> Features:
+def _joint(ratio: Array, variance: Array, emissivity: Array, of_emissivity: Array) -> Features:
     """Ratios (band, y, x) of all bands but the reference, and its emissivity (1, y, x); if told."""
     vague = ~(variance < (_VAGUE * ratio) ** 2)
     return Features(

@@ -453,12 +453,12 @@ def hold(
         stay |= sound & np.any(ratios[0] > _GAIN * ratios[1], axis=0)
     flags = np.uint32(Status.GRAY), np.uint32(Status.NO_BACKGROUND_MOTION)
     gray = (pooled["status"].values & flags[0]) != 0
-    gray_alone, still = ((per_pixel["status"].values & flag) != 0 for flag in flags)
+    gray_pixels, still = ((per_pixel["status"].values & flag) != 0 for flag in flags)
     stay |= _share(labels.values, gray) > _GRAY_SHARE
     common, stds = sound & valid & ~stay, per_pixel["object_temperature_std"].values
     # At one place nothing is added if most moving pixels of the material are gray alone.
     if not apart:
-        common &= _share(np.where(still, -1, labels.values), gray_alone) <= _GRAY_SHARE
+        common &= _share(np.where(still, -1, labels.values), gray_pixels) <= _GRAY_SHARE
     films = [result["object_temperature"].values for result in (pooled, per_pixel)]
     # Mean square D of the objects' difference, in deviations of the pixel alone.
     square, variance = np.zeros((2, *common.shape))
